@@ -62,6 +62,13 @@ def _listening(text: str) -> str:
     return text if text == LOCAL else _endpoint(text)
 
 
+def _network(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text))
+    except ValueError as error:
+        raise ValueError(f'{error}: write a network like "192.168.7.0/24"') from error
+
+
 def _command(command: tuple[str, ...]) -> tuple[str, ...]:
     if command and not command[0].startswith("/"):
         raise ValueError(f'{command[0]!r} is not an absolute path: write it like ["/usr/bin/logger", "-t", "otolith"]')
@@ -186,6 +193,7 @@ class AccessTable(StrictModel):
 
     passwords: Path | None = None  # File of lines name:password; with it, every connection needs one of them
     readers: tuple[str, ...] | None = None  # Names of certificates and users that may read; by default all that connect
+    networks: tuple[Annotated[str, AfterValidator(_network)], ...] | None = None  # That the service accepts
 
 
 class ZenohTable(StrictModel):

@@ -62,7 +62,8 @@ def writable(folder: Path) -> Path:
     except OSError as error:
         raise ServiceError(f"{folder}: cannot be created: {error.strerror}{way_out(folder)}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ServiceError(f"{folder}: not writable for this user{way_out(folder)}")
+        fault = "not writable for this user" if folder.is_dir() else "a file, not a folder: move it away"
+        raise ServiceError(f"{folder}: {fault}{way_out(folder)}")
     return folder
 
 

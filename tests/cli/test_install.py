@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
-from otolith.cli.operation.install import UNIT, drop_in, named_files
+from otolith.cli.operation.install import UNIT, _run, drop_in, named_files
 from otolith_drivers.canbus import bus as can_bus
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.conftest import EXAMPLES
 
 LOOPBACK = ("tcp/127.0.0.1:7447",)
@@ -88,6 +88,45 @@ def test_what_others_may_not_read_stays_so(file: Path, tmp_path: Path) -> None:
     assert [path.stat().st_mode & 0o777 for path in (copies[0], kept)] == [0o640, 0o640]
 
 
+def test_the_service_may_enter_the_folders_that_are_there(file: Path, tmp_path: Path) -> None:
+    """An administrator, or root with another umask, has made them for himself alone; other users stay outside."""
+    root = tmp_path / "root"
+    folders = [root / name for name in ("etc/otolith", "var/lib/otolith")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        folder.chmod(0o700)
+    for options in (["--dry-run"], []):
+        output = installed(file, root, *options)
+        assert "to run: chgrp otolith /etc/otolith /var/lib/otolith\nto run: chmod g+x /etc/otolith " in output
+        steps = ("systemd-sysusers", "chgrp", "chmod", "compile")
+        assert sorted(steps, key=output.index) == list(steps)
+        assert [folder.stat().st_mode & 0o777 for folder in folders] == [0o700, 0o700]  # --root runs no command
+    for folder in folders:
+        folder.chmod(0o711)
+    assert "chmod" not in installed(file, root)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_a_program_that_the_service_may_not_run_is_named(tmp_path: Path) -> None:
+    """Root has made the environment with a umask that closes it."""
+    program = Path(shutil.copy("/bin/true", tmp_path / "otolith"))
+    tmp_path.chmod(0o700)
+    with pytest.raises(ServiceError, match=f"{program}: user 'daemon' may not run it: open it"):
+        _run([str(program)], "daemon", "press-3")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to a group")
+def test_a_folder_of_another_group_is_not_taken_from_it(file: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    folder = root / "etc/otolith"
+    folder.mkdir(parents=True)
+    folder.chmod(0o750)
+    os.chown(folder, 0, 65533)
+    with pytest.raises(ServiceError, match=f"{folder}: user 'otolith' may not enter it: 'chmod o[+]x {folder}'"):
+        installed(file, root, "--dry-run")
+    assert list(folder.iterdir()) == []
+
+
 def test_a_file_that_another_machine_names_is_not_replaced_silently(file: Path, tmp_path: Path) -> None:
     root, dbc = tmp_path / "root", tmp_path / "dc-motor.dbc"
     installed(file, root)
@@ -129,6 +168,18 @@ def test_readers_whose_network_is_in_a_drop_in_of_ones_own_leave_1_0(file: Path,
     own = "[Service]\nIPAddressDeny=any\nIPAddressAllow=localhost 192.168.7.0/24\n"
     (folder / "override.conf").write_text(own, encoding="utf-8")
     assert exposure(tmp_path, "press-3") <= 1.0
+
+
+def test_the_service_accepts_packets_from_the_networks_of_its_readers_alone(file: Path, tmp_path: Path) -> None:
+    table = '[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]\naccess = { networks = ["192.168.7.0/24", "fd00::/8"] }\n'
+    file.write_text(file.read_text(encoding="utf-8") + table, encoding="utf-8")
+    installed(file, tmp_path)
+    text = (tmp_path / "etc/systemd/system/otolith@press-3.service.d/machine.conf").read_text(encoding="utf-8")
+    assert "IPAddressDeny=any\nIPAddressAllow=localhost\n" in text
+    assert text.endswith("IPAddressAllow=192.168.7.0/24\nIPAddressAllow=fd00::/8\n")
+    assert "# No IPAddressDeny: the addresses that drive " in drop_in(
+        "press-3", [{"type": "modbus", "host": "drive"}], ("tcp/0.0.0.0:7447",), (), networks=("192.168.7.0/24",)
+    )
 
 
 @pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])

@@ -4,6 +4,7 @@ import json
 import queue
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -291,7 +292,27 @@ def test_whatever_is_lost_or_repeated_is_passed_on_once_and_in_order(
     if got:
         begin = 0 if after is not None else got[0]
         assert {number for number in saved if begin <= number <= newest} <= set(got)
-    assert order.missed <= len(unsaved)
+        follows = [json.loads(text)["previous"] for text in passed[1:]]
+        assert order.missed == sum(before > last for last, before in zip(got, follows, strict=False))
+
+
+def test_watch_states_what_the_history_no_longer_has(tmp_path: Path, start: Callable[..., Process]) -> None:
+    """Its reader was away for longer than reports are kept."""
+    endpoint, path = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    start(ROUTER, endpoint)
+    daemon = start(DAEMON, path, endpoint, START)
+    handled, before = int(daemon.ask(10)), int(daemon.ask(20))
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM report WHERE sequence <= ?", (before,))
+    last = int(daemon.ask(5))
+    command = [sys.executable, "-m", "otolith", "watch", "--json", "--connect", endpoint, "--after", str(handled)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+        assert watch.stdout is not None
+        assert watch.stderr is not None
+        lines = [watch.stdout.readline() for _ in range(5)]
+        assert sequences(lines)[-1] == last
+        assert f"reports after number {handled} up to {before} are missing" in watch.stderr.readline()
+        watch.send_signal(signal.SIGINT)
 
 
 def test_messages_without_numbers_are_passed_on() -> None:

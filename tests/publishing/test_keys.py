@@ -1,6 +1,7 @@
 """``otolith keys``, the checks of the files that a session uses, and how readers find sockets."""
 
 import re
+import resource
 import socket
 from datetime import timedelta
 from pathlib import Path
@@ -25,6 +26,7 @@ from otolith.publishing.zenoh_config import (
 )
 from otolith.publishing.zenoh_session import Publisher
 from otolith_drivers.errors import ConfigurationError, ServiceError
+from tests.conftest import free_port
 from tests.health.test_events import report
 from tests.waiting import wait_for
 
@@ -52,7 +54,19 @@ def settings(site: Path, endpoint: str = ENDPOINT, access: AccessTable | None = 
     """The warning of the settings of a daemon."""
     tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
     table = ZenohTable(tls=tls, access=access or AccessTable())
-    return Access(table, site / "machine.toml").settings("otolith/here/motor", [endpoint])[1]
+    return Access(table, site / "machine.toml").settings("otolith/here/motor", [endpoint])[1].warning(utc_now())
+
+
+def test_a_certificate_that_the_disk_has_no_room_for_leaves_no_key(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))  # bytes: a key is shorter, a certificate longer
+    try:
+        with pytest.raises(ConfigurationError, match=r"ca.crt: cannot be written: File too large"):
+            make_authority(tmp_path, utc_now())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+    make_authority(tmp_path, utc_now())
 
 
 def test_keys_are_private_and_never_replaced(tmp_path: Path) -> None:
@@ -146,6 +160,24 @@ def test_a_certificate_that_expires_soon_is_named(site: Path) -> None:
     for kind in ("crt", "key"):
         (site / f"press.{kind}").write_bytes((site / f"old.{kind}").read_bytes())
     assert re.search(r"press\.crt: expires on \d{4}-\d\d-\d\d", settings(site))
+
+
+def test_a_daemon_that_runs_for_years_warns_of_its_certificate(site: Path, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    make_certificate(site, "own", ["127.0.0.1"], utc_now())
+    tls = TlsTable(ca=Path("ca.crt"), certificate=Path("own.crt"), key=Path("own.key"))
+    publisher = Publisher("here", "motor", [endpoint], Access(ZenohTable(tls=tls), site / "machine.toml"))
+    try:
+        for days in (0, CERTIFICATE_DAYS - 40):
+            publisher.warn_of_expiry(utc_now() + timedelta(days=days))
+        assert caplog.text == ""
+        for hours in range(48):
+            publisher.warn_of_expiry(utc_now() + timedelta(days=CERTIFICATE_DAYS - 20, hours=hours))
+        assert caplog.text.count("own.crt: expires on ") in {2, 3}
+        publisher.warn_of_expiry(utc_now() + timedelta(days=CERTIFICATE_DAYS + 1))
+        assert "own.crt: expired on " in caplog.text
+    finally:
+        publisher.close()
 
 
 def test_an_encrypted_endpoint_needs_certificates(site: Path) -> None:

@@ -99,6 +99,22 @@ def test_minutes_after_an_event_are_marked_too(tmp_path: Path, source: RecordedM
     assert len(omega(files[2].path)) == 30 * 200  # a file that was renamed while it was written
 
 
+def test_an_event_while_the_clock_was_ahead_marks_no_later_file(tmp_path: Path, source: RecordedMachine) -> None:
+    folder, reports = folder_of(tmp_path), list(noise(3))
+    events = next(after.events for after in assessed(report(index, 5.8) for index in range(9)) if after.events)
+    reports[0] = Report(reports[0].document.model_copy(update={"events": events}), reports[0].traces)
+    recording = RotatedRecording(folder.new_path(BEGIN), source, folder, BEGIN)
+    for one, now in zip(reports, (BEGIN + 1000 * DAY, BEGIN + 61.0, BEGIN + 1000.0), strict=True):
+        recording.add(one, now)
+    recording.close()
+    assert [file.is_marked for file in sorted(folder.files(), key=lambda file: file.begin)] == [
+        False,
+        False,
+        False,
+        True,
+    ]
+
+
 def test_the_group_may_read_files_whatever_the_mask_is(tmp_path: Path, source: RecordedMachine) -> None:
     before = os.umask(0o077)
     try:

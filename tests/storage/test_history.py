@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -332,7 +333,27 @@ def test_kept_databases_take_no_more_than_a_history_and_the_newest_stays(
         history.writer._close()
         path.write_bytes(bytes(size * MEGABYTE))
         history.writer._open()
-    assert [kept.stat().st_size // MEGABYTE for kept in sorted(path.parent.glob(f"*{KEPT}"))] == [30]
+    (kept,) = path.parent.glob(f"*{KEPT}")
+    assert kept.stat().st_size // MEGABYTE == 30
+    kept.rename(kept.with_name(f"{SITE}.{MACHINE}.20990101T000000000000{KEPT}"))  # the clock was ahead
+    history.writer._close()
+    path.write_bytes(bytes(29 * MEGABYTE))
+    history.writer._open()
+    assert [kept.stat().st_size // MEGABYTE for kept in path.parent.glob(f"*{KEPT}")] == [29]
+
+
+def test_a_database_that_another_process_locks_is_written_later(
+    opened: Callable[..., Simulated], path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    history = opened()
+    history.write(*documents(3))
+    with closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        history.writer.start()
+        history.writer.add(history.numbers.number(document(3, START + 8.0)))
+        wait_for(lambda: "is locked: end the other process" in caplog.text)
+    history.writer.stop(PATIENCE)
+    assert len(numbers_of(history.writer.reader)) == 4
 
 
 def test_a_database_that_is_deleted_meanwhile_is_made_again(opened: Callable[..., Simulated], path: Path) -> None:
@@ -458,6 +479,22 @@ def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day(opened: Callable[...
     for hour in range(24):
         history.prune(wrong + hour * HOUR, HOUR)
     assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, the clock is used
+
+
+@pytest.mark.parametrize("wrong", [0.0, START - 2 * DAY, START + 20 * DAY])
+def test_a_clock_that_was_wrong_for_a_while_deletes_no_reports(opened: Callable[..., Simulated], wrong: float) -> None:
+    """Without a battery it begins anywhere, until the network sets it right; reports of before the boot are there."""
+    history = opened(Bounds(20 * MEGABYTE, 3650, 24))
+    history.write(*documents(100))
+    history.write(*documents(100, start=wrong))
+    history.write(*documents(100, start=START + HOUR))
+    for hours in range(1, 23):
+        history.prune(START + hours * HOUR, HOUR)
+        assert len(numbers_of(history.writer.reader)) == 300, hours
+    history.write(*documents(100, start=START + 30 * HOUR))
+    for hours in range(24, 32):
+        history.prune(START + hours * HOUR, HOUR)
+    assert len(numbers_of(history.writer.reader)) == 100
 
 
 WRITES_FOR_EVER = """

@@ -175,6 +175,17 @@ def test_only_the_newest_refused_files_are_kept(tmp_path: Path) -> None:
     assert [path.read_text(encoding="utf-8") for path in kept] == [f"damaged {n}" for n in range(3, MAX_KEPT + 3)]
 
 
+def test_a_refused_file_is_kept_although_others_are_from_a_clock_that_was_ahead(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    store.components_path.parent.mkdir(parents=True, exist_ok=True)
+    for number in range(MAX_KEPT):
+        store.components_path.with_suffix(f".2099010{number}T000000000000.kept.json").touch()
+    store.components_path.write_text("damaged", encoding="utf-8")
+    kept = store.set_aside()
+    assert kept.read_text(encoding="utf-8") == "damaged"
+    assert len(list(kept.parent.glob("*.kept.json"))) == MAX_KEPT
+
+
 def test_a_component_is_still_there_after_a_year(tmp_path: Path) -> None:
     torque = lambda _, angle, *__: 0.004 * math.sin(angle)  # noqa: E731 - as in the motor's faults
     after = windows(simulate_motor("sweep", 8.0, Faults(torque=torque), seed=13), START + YEAR)

@@ -48,6 +48,7 @@ def test_the_oldest_are_deleted_first_and_no_more_than_needed() -> None:
 
 def test_what_is_too_old_is_deleted_unless_it_is_around_an_event() -> None:
     files = [made(15 * DAY, 1), made(15 * DAY, 1, marked=True), made(13 * DAY, 1)]
+    files += [made(hours * HOUR, 1) for hours in range(25)]  # the clock is right
     assert kept(files) == files[1:]
 
 
@@ -62,6 +63,22 @@ def test_files_around_an_event_are_not_deleted_in_vain() -> None:
     files = [made(hours * HOUR, 100, marked=hours > 1) for hours in range(5)]
     assert kept(files, shortage=300) == files[2:4]
     assert kept(files, shortage=600) == files[2:]
+
+
+def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day() -> None:
+    before = [made(400 * DAY + hours * HOUR, 1) for hours in range(15 * 24)]
+    old = [file for file in before if file.end < before[0].end - BUDGET.max_age]
+    assert old
+    for hours in range(24):  # of operation with the new time
+        since = [made(age * HOUR, 1) for age in range(hours)]
+        assert [file for file in before + since if file not in kept(before + since)] == old
+    assert kept(before + [made(age * HOUR, 1) for age in range(25)]) == [made(age * HOUR, 1) for age in range(25)]
+
+
+def test_files_of_a_clock_that_was_ahead_go_before_newer_ones() -> None:
+    ahead = [made(-400 * DAY + hours * HOUR, 300) for hours in range(3)]
+    newer = [made(hours * HOUR, 300) for hours in range(3)]
+    assert kept([*newer, *ahead]) == newer
 
 
 FILES = st.lists(st.builds(made, st.floats(-DAY, 20 * DAY), st.integers(0, 500), marked=st.booleans()), max_size=12)

@@ -236,6 +236,12 @@ def test_a_state_of_another_user_is_named_with_the_way_out(store: StateStore, mo
         writable(store.lock_path.parent)
 
 
+def test_a_file_in_the_place_of_a_folder_is_named(store: StateStore) -> None:
+    store.lock_path.parent.touch()
+    with pytest.raises(ServiceError, match=r"components: a file, not a folder: move it away"):
+        store.lock()
+
+
 def test_a_folder_that_must_not_be_searched_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the folder of another user: units and kernels are then not cached."""
     monkeypatch.setattr(Path, "exists", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))

@@ -21,7 +21,6 @@ from otolith_drivers.errors import ConfigurationError
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_PEM_BYTES = 1 << 16  # of a file with certificates, a key or passwords
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' makes
-EXPIRY_WARNING = timedelta(days=30)  # rest of the validity from which the log warns
 CLOCK_TOLERANCE = timedelta(hours=1)  # by which a new certificate is valid before it was made
 
 Key = tuple[str, ...]  # Key of the machine file, or option, that names a file
@@ -52,8 +51,8 @@ def authorities(path: Path, key: Key) -> list[x509.Certificate]:
         raise ConfigurationError(f"{path}: not a certificate in PEM form", key) from error
 
 
-def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str], now: datetime) -> str:
-    """Check certificate and key; return a warning if the certificate expires soon, else an empty text.
+def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str], now: datetime) -> datetime:
+    """Check certificate and key; return until when the certificate is valid.
 
     ``keys`` name CA, certificate and private key for the error. ``hosts`` are the names or addresses where it listens.
 
@@ -83,9 +82,7 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
             remedy = f"'otolith keys add DIR NAME --host {host}' makes one"
             valid = ", ".join(sorted(names)) or "no host"
             raise ConfigurationError(f"{name}: not for {host}, but for {valid}; {remedy}", at_certificate)
-    if own.not_valid_after_utc - now < EXPIRY_WARNING:
-        return f"{name}: expires on {own.not_valid_after_utc:%Y-%m-%d}; no connection is possible after it"
-    return ""
+    return own.not_valid_after_utc
 
 
 def _private_key(path: Path, key: Key) -> PrivateKeyTypes:
@@ -215,6 +212,8 @@ def _write(stem: Path, private: ec.EllipticCurvePrivateKey, certificate: x509.Ce
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
                 file.write(data)
         except OSError as error:
+            for made in () if isinstance(error, FileExistsError) else paths:  # a half would prevent the next try
+                made.unlink(missing_ok=True)
             raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error
 
 

@@ -113,7 +113,8 @@ class RotatedRecording:
             self._recording.add(report)
             return
         if self._folder.budget.is_full(now - self._begin, self.path.stat().st_size):
-            self.path, self._begin = self._folder.new_path(now, marked=now < self._marked_until), now
+            is_marked = now < self._marked_until <= now + EVENT_MARGIN  # not if the clock was set back meanwhile
+            self.path, self._begin = self._folder.new_path(now, marked=is_marked), now
             self._recording.open(self.path)
             self._set_mode()
         if announcements(report.document):

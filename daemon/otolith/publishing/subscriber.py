@@ -31,18 +31,14 @@ class MessageOrder:
     """
 
     def __init__(
-        self,
-        query: Callable[[str, int], list[str]],
-        on_message: Callable[[str], None],
-        pause: Callable[[], bool],
-        after: int | None,
-        topics: tuple[Topic, ...] = (REPORT,),
-    ) -> None:
+        self, query: Callable[[str, int], list[str]], on_message: Callable[[str], None],
+        pause: Callable[[], bool], after: int | None, topics: tuple[Topic, ...] = (REPORT,),
+    ) -> None:  # fmt: skip
         """``pause`` waits between two queries and returns whether to stop; ``after`` is where unknown keys begin."""
         self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
         self._topics = topics
         self._last: dict[str, int] = {}
-        self.missed = 0  # Gaps that no query could fill
+        self.missed, self.gap = 0, (0, 0)  # Gaps that no query could fill; numbers before the last one and at its end
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -66,7 +62,7 @@ class MessageOrder:
                 last = self._last.get(key, last)
             if sequence <= last:
                 return
-            self.missed += previous is not None and previous > last
+            self._count_gap(last, previous)
         self._pass_on(key, text, sequence)
 
     def catch_up(self, key: str) -> None:
@@ -77,6 +73,7 @@ class MessageOrder:
             texts = self._query(key, last)
             for number, text in sorted((_numbers(text)[0] or 0, text) for text in texts):
                 if number > last:
+                    self._count_gap(last, _numbers(text)[1])
                     last = number
                     self._pass_on(key, text, number)
             is_full = len(texts) >= MAX_REPLIES
@@ -90,6 +87,11 @@ class MessageOrder:
             self.catch_up(key)
             if self._last.get(key, 0) >= previous or self._pause():
                 return
+
+    def _count_gap(self, last: int, previous: int | None) -> None:
+        """Count a gap if the message before the next one, ``previous``, is later than ``last``, which is 0 at first."""
+        if last and previous is not None and previous > last:
+            self.missed, self.gap = self.missed + 1, (last, previous)
 
     def _pass_on(self, key: str, text: str, sequence: int | None) -> None:
         if sequence is not None:
@@ -106,13 +108,9 @@ class Subscriber:
     """Passes the messages of machines to ``on_message``, which may block; it runs in a thread of its own."""
 
     def __init__(
-        self,
-        connection: Connection,
-        on_message: Callable[[str], None],
-        machine: str = "*",
-        topics: tuple[Topic, ...] = (REPORT,),
-        after: int | None = None,
-    ) -> None:
+        self, connection: Connection, on_message: Callable[[str], None], machine: str = "*",
+        topics: tuple[Topic, ...] = (REPORT,), after: int | None = None,
+    ) -> None:  # fmt: skip
         """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``.
 
         Without endpoints it reads all daemons on this computer that this user may read.

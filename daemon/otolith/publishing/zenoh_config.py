@@ -4,6 +4,7 @@ import os
 import resource
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from otolith.machine_file import LOCAL, ZenohTable, host_of
@@ -24,6 +25,7 @@ HANDSHAKE_TIMEOUT = 2000  # ms
 TLS_TIMEOUT = 600_000  # ms for the TLS handshake, before that of Zenoh: one that fails stops Zenoh for 0.1 s
 MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens with TLS
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
+EXPIRY_WARNING = timedelta(days=30)  # rest of the validity of a certificate from which the log warns
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux
 
 Settings = dict[str, object]  # Keys of Zenoh's configuration and their values
@@ -48,38 +50,53 @@ class Connection:
 
 
 @dataclass(frozen=True, slots=True)
+class Validity:
+    """Until when the certificate of a daemon is valid; one without certificate needs none."""
+
+    certificate: Path = Path()
+    end: datetime | None = None
+
+    def warning(self, now: datetime) -> str:
+        """Return that it expires soon or has expired; else an empty text."""
+        if self.end is None or self.end - now >= EXPIRY_WARNING:
+            return ""
+        time = f"{'expired' if now > self.end else 'expires'} on {self.end:%Y-%m-%d}"
+        return f"{self.certificate}: {time}; then nobody can connect: replace it and its key, and restart the daemon"
+
+
+@dataclass(frozen=True, slots=True)
 class Access:
     """The tables of the machine file for the session of its daemon; ``path`` is that of the file."""
 
     zenoh: ZenohTable = field(default_factory=ZenohTable)
     path: Path = Path()
 
-    def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, str]:
-        """Return settings to publish below ``prefix``, and a warning or ""; raise ConfigurationError for a bad file."""
+    def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, Validity]:
+        """Return settings to publish below ``prefix``, and their validity; raise ConfigurationError for a bad file."""
         listen = tuple(listen)
         try:
-            encryption, warning = self._encryption(listen)
+            encryption, validity = self._encryption(listen)
             passwords = self._passwords()
         except ConfigurationError as error:
             Context(read(self.path)).fail(error.key, str(error))
             raise
-        return {**_limits(), **encryption, **passwords, "access_control": self._control(prefix)}, warning
+        return {**_limits(), **encryption, **passwords, "access_control": self._control(prefix)}, validity
 
-    def _encryption(self, listen: tuple[str, ...]) -> tuple[Settings, str]:
-        """Settings of TLS, once its files have been checked; and the warning of :func:`check_identity`."""
+    def _encryption(self, listen: tuple[str, ...]) -> tuple[Settings, Validity]:
+        """Settings of TLS, once its files have been checked, and until when its certificate is valid."""
         encrypted = [endpoint for endpoint in (*listen, *self.zenoh.connect) if endpoint.startswith(ENCRYPTED)]
         if self.zenoh.tls is None:
             if encrypted:
                 remedy = "[zenoh.tls] with ca, certificate and key is missing; 'otolith keys' makes them"
                 raise ConfigurationError(f"{encrypted[0]}: {remedy}", ("zenoh",))
-            return {}, ""
+            return {}, Validity()
         from otolith.publishing.certificates import Identity, check_identity, utc_now  # noqa: PLC0415 - slow to import
 
         table, folder = self.zenoh.tls, self.path.parent.absolute()
         identity = Identity(folder / table.ca, folder / table.certificate, folder / table.key)
         hosts = [host_of(endpoint) for endpoint in listen if endpoint.startswith(ENCRYPTED)]
         keys = [("zenoh", "tls", name) for name in ("ca", "certificate", "key")]
-        warning = check_identity(identity, keys, hosts, utc_now())
+        validity = Validity(identity.certificate, check_identity(identity, keys, hosts, utc_now()))
         own = {
             f"{side}_{kind}": str(path)
             for side in ("listen", "connect")
@@ -87,7 +104,7 @@ class Access:
         }
         return {
             TLS: {**own, "root_ca_certificate": str(identity.ca), "enable_mtls": table.clients, **_VERIFIED}
-        }, warning
+        }, validity
 
     def _passwords(self) -> Settings:
         access = self.zenoh.access

@@ -9,8 +9,8 @@ import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Literal, Protocol
+from datetime import UTC, date, datetime
+from typing import Literal
 
 import zenoh
 
@@ -26,6 +26,7 @@ from otolith.publishing.zenoh_config import (
     Settings,
     raise_descriptor_limit,
 )
+from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
@@ -36,15 +37,6 @@ MAX_REPLIES = 1000  # to one query, see docs/reference/thresholds-runtime.md
 UNITS = {"u": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _RANGE = re.compile(r"([\[\]])([^\[\]]*)\.\.([^\[\]]*)([\[\]])")
 _NOW = re.compile(r"now\(\s*(?:([+-]?[0-9.]+)\s*(u|ms|s|m|h|d|w|))?\s*\)")
-
-
-class Archive(Protocol):
-    """Where the published documents are kept."""
-
-    def messages(
-        self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
-    ) -> list[str]:
-        """Return the first documents above a sequence number and within times; see HistoryReader."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +85,7 @@ def _instant(text: str, now: float) -> float | None:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: Archive | None) -> None:
+def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: HistoryWriter | None) -> None:
     """Reply with the selected documents of a ``kind``, oldest first; with the ``latest`` if nothing is selected."""
     try:
         selected = selection(query.parameters, time.time())
@@ -204,17 +196,13 @@ class Publisher:
     """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
 
     def __init__(
-        self,
-        site: str,
-        machine: str,
-        listen: Iterable[str],
-        access: Access = Access(),  # noqa: B008 - immutable
-        archive: Archive | None = None,
-    ) -> None:
+        self, site: str, machine: str, listen: Iterable[str],
+        access: Access = Access(), archive: HistoryWriter | None = None,  # noqa: B008 - immutable
+    ) -> None:  # fmt: skip
         """Queries for earlier reports and events are answered from ``archive``."""
-        settings, warning = access.settings(prefix(site, machine), listen)
-        if warning:
-            log.warning("%s", warning)
+        settings, self._validity = access.settings(prefix(site, machine), listen)
+        self._warned_on: date | None = None
+        self.warn_of_expiry(datetime.now(UTC))
         self._archive = archive
         self._session = session(listen, access.zenoh.connect, settings)
         self._site, self._machine = site, machine
@@ -247,6 +235,12 @@ class Publisher:
                 encoding=zenoh.Encoding.APPLICATION_JSON,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
+
+    def warn_of_expiry(self, now: datetime) -> None:
+        """Log once a day that the certificate expires soon or has expired."""
+        if now.date() != self._warned_on and (warning := self._validity.warning(now)):
+            self._warned_on = now.date()
+            log.warning("%s", warning)
 
     def close(self) -> None:
         """Close the session; subscribers see the liveliness token disappear."""

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
@@ -378,6 +379,8 @@ class Service:
             self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
+        if is_due and self._publisher is not None:
+            self._publisher.warn_of_expiry(datetime.now(UTC))
         self._notifier.send(f"STATUS={line}")
         log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line)
 

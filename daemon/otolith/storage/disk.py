@@ -57,7 +57,8 @@ class WriterThread(ABC):
         """Log an error, once while it stays the same."""
         text = str(error) or type(error).__name__
         if isinstance(error, OSError | sqlite3.Error):
-            text += ": check the disk and its permissions"
+            is_locked = isinstance(error, sqlite3.OperationalError) and "locked" in text
+            text += f": {'end the other process that uses it' if is_locked else 'check the disk and its permissions'}"
         if text != self._last_error:
             log.warning("%s: %s", self._loss, text)
         self._last_error, self._retry_at = text, time.monotonic() + WRITE_RETRY

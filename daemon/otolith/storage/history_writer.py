@@ -33,6 +33,7 @@ from otolith.storage.history import (
     create,
     history_path,
 )
+from otolith.storage.recording_files import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP
 from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
@@ -48,9 +49,6 @@ PRUNE_INTERVAL = 60.0  # s between two deletions by age
 MAX_LOG_BYTES = 32 << 20  # of the write-ahead log, which a reader that never ends keeps from being merged
 QUERY_WAIT = 1.0  # s that a query waits for what is not yet written
 AGES = {WINDOW: 1.0 * DAY, MINUTE: 14.0 * DAY, HOUR: 366.0 * DAY}  # s; of days, events and findings the machine file
-MAX_LEAP = 1.0 * DAY  # s by which the clock may pass the time that the daemon ran
-LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is used
-MAX_AHEAD = 1.0 * DAY  # s after the present from which a time is that of a wrong clock
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
 MIN_REPORTS = 1800  # that are kept before coarser values go
 CHUNK = 1000  # rows of a table in one transaction
@@ -81,11 +79,11 @@ class Retention:
             oldest = clock - min(AGES.get(resolution, longest), longest)
             while self._delete_samples(resolution, oldest):
                 pass
-        # By sequence: a report from a time when the clock was ahead goes with those that were published after it.
-        oldest_rows = f"(SELECT sequence, time FROM report ORDER BY sequence LIMIT {CHUNK})"  # noqa: S608 - our own names
-        latest = f"(SELECT max(sequence) FROM {oldest_rows} WHERE time < ?)"  # noqa: S608 - our own names
+        # By sequence: reports with the time of a wrong clock, ahead or behind, go with those around them.
         resend = clock - min(self._bounds.resend_hours * HOUR, longest)
-        while self._delete_reports(f"sequence <= {latest}", resend):
+        recent = "coalesce((SELECT min(sequence) FROM report WHERE time BETWEEN ?1 AND ?2), 9e18)"
+        latest = f"(SELECT max(sequence) FROM report WHERE time < ?1 AND sequence < {recent})"  # noqa: S608 - our own names
+        while self._delete_reports(f"sequence <= {latest}", resend, clock + MAX_AHEAD):
             pass
         for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour"), ("state", "since")):
             self._delete(f"DELETE FROM {table} WHERE {column} < ?", clock - longest)  # noqa: S608 - our own names
@@ -355,16 +353,16 @@ class HistoryWriter(WriterThread):
             with contextlib.suppress(FileNotFoundError):
                 self._path.with_name(f"{self._path.name}{suffix}").rename(kept.with_name(f"{kept.name}{suffix}"))
         self._path.with_name(f"{self._path.name}-shm").unlink(missing_ok=True)
-        self._limit_kept()
+        self._limit_kept(kept)
         self._connect()
         return f"{self._path}: begun anew: {reason}; the file is kept as {kept.name}"
 
-    def _limit_kept(self) -> None:
-        """Delete the oldest kept databases beyond the size of a history; the newest stays."""
+    def _limit_kept(self, latest: Path) -> None:
+        """Delete the oldest kept databases beyond the size of a history; the ``latest`` stays, with any clock."""
         total, names = 0, self._path.parent.glob(f"{self.reader.site}.{self.reader.machine}.*{KEPT}")
-        for index, path in enumerate(sorted(names, reverse=True)):
+        for path in sorted(names, key=lambda path: (path == latest, path.name), reverse=True):
             total += path.stat().st_size
-            if index and total > self._bounds.max_bytes:
+            if path != latest and total > self._bounds.max_bytes:
                 path.unlink()
                 path.with_name(f"{path.name}-wal").unlink(missing_ok=True)
 

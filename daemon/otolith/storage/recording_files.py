@@ -23,6 +23,9 @@ MIN_FREE_BYTES = 100 << 20  # kept free on any disk
 MIN_FREE_SHARE = 0.05  # of the disk, kept free from recordings that the daemon makes by itself
 RESUME_FACTOR = 1.1  # times what is kept free, for recording to go on
 EVENT_MARGIN = 300.0  # s before and after a change of an event whose files are marked
+MAX_LEAP = 86_400.0  # s by which the clock may pass the time of operation
+LEAP_PATIENCE = 86_400.0  # s of operation after which a clock that leapt is used
+MAX_AHEAD = 86_400.0  # s after the present from which a time is that of a wrong clock
 MAX_EVENT_SHARE = 0.5  # of the budget, for marked files
 DAY, MEGABYTE, GIGABYTE = 86_400.0, 1e6, 1e9  # s, bytes
 
@@ -76,10 +79,13 @@ def expendable(
 
     ``size`` is that of the file that is being written, which is not among ``files``; ``shortage`` is how many bytes
     more must be free on the disk. Marked files have no greatest age, but a share of the budget; they are not deleted
-    for a disk that even so would not have room.
+    for a disk that even so would not have room. Files from after ``now`` are the oldest: the clock was set back since.
     """
-    ordered = sorted(files, key=lambda file: (file.is_marked, file.begin, file.path.name))
-    gone = {file for file in ordered if not file.is_marked and now - file.end > budget.max_age}
+    ordered = sorted(
+        files, key=lambda file: (file.is_marked, file.begin <= now + MAX_AHEAD, file.begin, file.path.name)
+    )
+    clock = _clock(files, now)
+    gone = {file for file in ordered if not file.is_marked and clock - file.end > budget.max_age}
     excess = sum(file.size for file in ordered if file.is_marked) - MAX_EVENT_SHARE * budget.max_bytes
     for file in ordered:
         if file.is_marked and excess > 0:
@@ -93,6 +99,16 @@ def expendable(
         if is_needed and file not in gone:
             yield file
             freed += file.size
+
+
+def _clock(files: Sequence[RecordingFile], now: float) -> float:
+    """Return ``now``, or the end of the last file before a leap of the clock: a wrong clock deletes nothing."""
+    begin = now
+    for file in sorted(files, key=lambda file: file.end, reverse=True):
+        if begin - file.end > MAX_LEAP:
+            return file.end if now - begin < LEAP_PATIENCE else now
+        begin = min(begin, file.begin)
+    return now
 
 
 def shortage_of(folder: Path, share: float = 0.0, factor: float = 1.0) -> int:

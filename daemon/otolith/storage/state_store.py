@@ -200,7 +200,7 @@ class StateStore:
             raise ServiceError(f"{self.components_path}: cannot be renamed to {kept.name}: {error.strerror}") from error
         prefix = f"{self.components_path.stem}."
         names = (path for path in kept.parent.iterdir() if path.name.startswith(prefix) and path.name.endswith(KEPT))
-        for old in sorted(names, key=lambda path: path.name)[:-MAX_KEPT]:
+        for old in sorted(names, key=lambda path: (path == kept, path.name))[:-MAX_KEPT]:  # whatever the clock is
             with contextlib.suppress(OSError):
                 old.unlink()
         return kept

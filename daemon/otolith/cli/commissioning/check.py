@@ -5,6 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.cli.common import progress_line
@@ -102,8 +103,8 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     for state, noise in zip(twin.states, problem.process_noise, strict=True):
         lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
     endpoints = listening(file.zenoh.listen, f"{file.machine.site}.{file.machine.name}")
-    _, warning = Access(file.zenoh, machine.path).settings(prefix(file.machine.site, file.machine.name), endpoints)
-    lines += [f"! {warning}"] if warning else []
+    _, validity = Access(file.zenoh, machine.path).settings(prefix(file.machine.site, file.machine.name), endpoints)
+    lines += [f"! {warning}"] if (warning := validity.warning(datetime.now(UTC))) else []
     lines.append(
         f"reports on {', '.join(endpoints) or 'no endpoint'}, keys {prefix(file.machine.site, file.machine.name)}/..."
     )

@@ -57,15 +57,9 @@ def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
 @AS_JSON
 @click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
 def history(
-    machine: str,
-    since: float,
-    names: tuple[str, ...],
-    every: str | None,
-    only_events: bool,
-    as_csv: bool,
-    as_json: bool,
-    parquet: Path | None,
-) -> None:
+    machine: str, since: float, names: tuple[str, ...], every: str | None,
+    only_events: bool, as_csv: bool, as_json: bool, parquet: Path | None,
+) -> None:  # fmt: skip
     """Show what was estimated and announced before.
 
     FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
@@ -153,7 +147,7 @@ def samples_since(reader: "HistoryReader", interval: str, since: float, names: S
     """Return the values of each ``interval`` since a time, of the parameters ``names`` or of all."""
     from otolith.storage.history import RESOLUTIONS
 
-    seconds = next(seconds for seconds, name in RESOLUTIONS.items() if name == interval)
+    seconds = {name: seconds for seconds, name in RESOLUTIONS.items()}[interval]
     return reader.samples(seconds, since - seconds, names)  # with the interval that contains it
 
 
@@ -198,12 +192,9 @@ def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
 
 
 def _print_json(
-    reader: "HistoryReader",
-    interval: str,
-    since: float,
-    samples: "Iterable[HistorySample]",
-    events: "Iterable[EventDocument]",
-) -> None:
+    reader: "HistoryReader", interval: str, since: float,
+    samples: "Iterable[HistorySample]", events: "Iterable[EventDocument]",
+) -> None:  # fmt: skip
     content = {
         "machine": reader.machine,
         "site": reader.site,
@@ -219,15 +210,9 @@ def _print_json(
 
 
 def _print_table(
-    reader: "HistoryReader",
-    interval: str,
-    since: float,
-    samples: "Sequence[HistorySample]",
-    events: "Sequence[EventDocument]",
-    bundles: "Mapping[int | None, Path]",
-    *,
-    with_findings: bool,
-) -> None:
+    reader: "HistoryReader", interval: str, since: float, samples: "Sequence[HistorySample]",
+    events: "Sequence[EventDocument]", bundles: "Mapping[int | None, Path]", *, with_findings: bool,
+) -> None:  # fmt: skip
     from rich.console import Console
 
     from otolith.cli.operation.live_table import event_style

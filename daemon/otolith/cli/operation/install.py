@@ -5,6 +5,7 @@ Each step of the installation is idempotent, and shown by ``--dry-run``.
 
 import contextlib
 import os
+import pwd
 import re
 import shlex
 import shutil
@@ -64,13 +65,15 @@ def install(file: Path, dry_run: bool, root: Path) -> None:
     if is_here and not dry_run and os.geteuid() != 0:
         raise ServiceError("install needs root: use sudo, or --root DIR to look at the files, or --dry-run")
     files = list(_files(file))
+    read = [folder for item in files for folder in item.path.parents if ETC in (folder, *folder.parents)]
+    closed = closed_folders([*read, Path("var/lib/otolith"), Path("var/cache/otolith")], root)
     for item in files:
         others = [other.name for other in _machines_with(root / item.path, root / ETC) if other.name != file.name]
         if _put(item, root, dry_run=dry_run) and others:
             remedy = "if they need another one, give this file another name"
             click.echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
-    for command, user in _commands(file.stem, private):
+    for command, user in _commands(file.stem, private, closed):
         click.echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
         if is_here and not dry_run:
             _run(command, user, file.stem)
@@ -91,7 +94,8 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
     command = bool(machine.file.machine.on_event)
-    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command)
+    networks = zenoh.access.networks
+    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command, networks=networks)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
     for name in [Path(file.name), *named_files(file)]:
         source = file.parent / name
@@ -122,11 +126,13 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def drop_in(
-    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *, command: bool = False
-) -> str:
+    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *,
+    command: bool = False, networks: Sequence[str] | None = None,
+) -> str:  # fmt: skip
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
-    ``command``: the daemon runs one for each event, which may use the network of this computer.
+    ``command``: the daemon runs one for each event, which may use the network of this computer. ``networks`` are those
+    of the readers, None if they are not known.
     """
     from otolith.machine_file import address_of, host_of
 
@@ -149,14 +155,15 @@ def drop_in(
         lines += [] if sockets else ["PrivateNetwork=yes"]
     local = {host: (address := address_of(host)) and address.is_loopback for host in hosts + published}
     local["localhost"] = True
-    unknown = [host for host in hosts if local[host] is None] + [host for host in published if not local[host]]
+    unknown = [host for host in hosts if local[host] is None]
+    unknown += [host for host in published if networks is None and not local[host]]
     if unknown or foreign:
         names = ", ".join(dict.fromkeys([*unknown, *foreign]))
         lines += [f"# No IPAddressDeny: the addresses that {names} stands for are not known."]
         lines += ["# Its devices are hidden: 'Run Otolith as a service' shows how to allow them."] if foreign else []
         return "\n".join([*lines, ""])
     multicast = ["multicast"] if "udp_multicast" in buses else []
-    allowed = dict.fromkeys(["localhost", *multicast, *hosts])
+    allowed = dict.fromkeys(["localhost", *multicast, *hosts, *(networks or ())])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
 
 
@@ -212,12 +219,36 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     return before is not None
 
 
-def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None]]:
-    """Return the commands of an installation, each with the user who runs it, root if None."""
+def closed_folders(folders: Sequence[Path], root: Path) -> list[str]:
+    """Return the ``folders`` below ``root`` that exist and that the user of the service may not enter.
+
+    Raises ServiceError for one that is open to a group of its own: only its owner can decide who else may enter it.
+    """
+    user = group = -1  # before the first installation
+    with contextlib.suppress(KeyError):
+        user, group = pwd.getpwnam(USER)[2:4]
+    closed: dict[str, None] = {}
+    for folder in filter(lambda each: (root / each).is_dir(), folders):
+        status = (root / folder).stat()
+        needed = 0o100 if status.st_uid == user else 0o010 if status.st_gid == group else 0o001
+        if not status.st_mode & needed:
+            if status.st_gid not in (0, group, os.getegid()) and status.st_mode & 0o070:
+                remedy = f"'chmod o+x {root / folder}' lets it, and every other user of this computer"
+                raise ServiceError(f"{root / folder}: user {USER!r} may not enter it: {remedy}")
+            closed[f"/{folder}"] = None
+    return list(closed)
+
+
+def _commands(name: str, private: list[str], closed: list[str]) -> list[tuple[list[str], str | None]]:
+    """Return the commands of an installation, each with the user who runs it, root if None.
+
+    The group of the service may enter ``closed`` folders afterwards, and nobody else.
+    """
     cache, program = f"/var/cache/otolith/{name}", str(PROGRAM if PROGRAM.exists() else Path(sys.argv[0]).absolute())
     return [
         (["systemd-sysusers"], None),
-        *([(["chgrp", USER, *private], None)] if private else []),
+        *([(["chgrp", USER, *private, *closed], None)] if private or closed else []),
+        *([(["chmod", "g+x", *closed], None)] if closed else []),
         (["systemctl", "daemon-reload"], None),
         (["install", "-d", "-m", "0700", "-o", USER, "-g", USER, cache], None),
         ([program, "compile", f"/etc/otolith/{name}.toml"], USER),
@@ -227,9 +258,13 @@ def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None
 def _run(command: list[str], user: str | None, name: str) -> None:
     environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": f"/var/cache/otolith/{name}"}
     extra_groups = None if user is None else ()
-    done = subprocess.run(  # noqa: S603 - the commands above, without a shell
-        command, env=environment, user=user, group=user, extra_groups=extra_groups, check=False
-    )
+    try:
+        done = subprocess.run(  # noqa: S603 - the commands above, without a shell
+            command, env=environment, user=user, group=user, extra_groups=extra_groups, check=False
+        )
+    except PermissionError as error:
+        remedy = "open it, its environment, and the folders of both and of their Python to all users (chmod go+rX)"
+        raise ServiceError(f"{command[0]}: user {user or 'root'!r} may not run it: {remedy}") from error
     if done.returncode:
         raise ServiceError(f"{shlex.join(command)}: ended with exit code {done.returncode}; repeat the installation")
 

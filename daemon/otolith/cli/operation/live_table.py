@@ -36,6 +36,7 @@ from otolith.health.text import (
 from otolith_drivers.units import equation_text
 
 if TYPE_CHECKING:
+    from otolith.publishing.subscriber import Subscriber
     from otolith.publishing.zenoh_config import Connection
 
 HISTORY = 200  # windows that the curve of a parameter can show
@@ -332,7 +333,7 @@ def watch_reports(
     with Subscriber(connection, receive, machine, after=after) as subscriber:
         try:
             if as_json:
-                _stream(texts, subscriber.state, stopped)
+                _stream(texts, subscriber, stopped)
                 return
             table = LiveTable(subscriber.state)
             with Live(table, console=Console(), refresh_per_second=5):
@@ -343,13 +344,17 @@ def watch_reports(
             ended.set()
 
 
-def _stream(texts: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:
-    """Print reports as lines; print the state to standard error when it changes while no report comes."""
-    latest, printed = time.monotonic(), ""
+def _stream(texts: "queue.Queue[str]", subscriber: "Subscriber", stopped: Callable[[], bool]) -> None:
+    """Print reports as lines; print to standard error what is missing, and the state while no report comes."""
+    latest, printed, missed, state = time.monotonic(), "", 0, subscriber.state
     while not stopped():
         lines = drain(texts, PAUSE)
         sys.stdout.writelines(f"{line}\n" for line in lines)
         sys.stdout.flush()
+        if subscriber.order.missed != missed:
+            missed, (last, end) = subscriber.order.missed, subscriber.order.gap
+            remedy = "the daemon no longer has them, see [history] resend_hours"
+            sys.stderr.write(f"reports after number {last} up to {end} are missing: {remedy}; gaps: {missed}\n")
         if lines:
             latest = time.monotonic()
         elif time.monotonic() - latest > PATIENCE and state() != printed:
