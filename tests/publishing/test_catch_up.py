@@ -40,6 +40,7 @@ with zenoh.open(config):
 """
 
 # What the daemon does with its reports. Each line of standard input publishes so many; the answer is the last number.
+# Of a negative number, nothing reaches Zenoh: a router drops what a reader that is too slow does not fetch.
 DAEMON = """
 import sys
 from pathlib import Path
@@ -57,10 +58,11 @@ publisher = Publisher(SITE, MACHINE, [], Access(ZenohTable(listen=(), connect=(s
 reports = documents(1_000_000, start=begin)
 print("open", flush=True)
 for line in sys.stdin:
-    for _ in range(int(line)):
+    for _ in range(abs(int(line))):
         report = numbers.number(next(reports))
         writer.add(report)
-        publisher.publish(report)
+        if int(line) > 0:
+            publisher.publish(report)
         if len(writer._waiting) > 200:
             writer._written.wait(60.0)
     writer._written.wait(60.0)
@@ -348,6 +350,26 @@ def test_watch_ends_as_asked_while_no_daemon_answers() -> None:
         watch.terminate()
         assert watch.stderr.read() == ""
     assert watch.wait(PATIENCE) == 128 + signal.SIGTERM
+
+
+def test_what_was_lost_comes_without_a_later_message(start: Callable[..., Process], tmp_path: Path) -> None:
+    endpoint, path = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    start(ROUTER, endpoint)
+    daemon = start(DAEMON, path, endpoint, START)
+    reports, events = list[str](), list[str]()
+
+    def receive(text: str) -> None:
+        (reports if "schema" in json.loads(text) else events).append(text)
+
+    with Subscriber(Connection((endpoint,)), receive, topics=(REPORT, EVENT)) as subscriber:
+        wait_for(lambda: bool(daemon.ask(1)) and bool(reports))
+        last = int(daemon.ask(-300))
+        kept = HistoryWriter(path, BOUNDS).reader.messages("event", 100)
+        first = sequences(reports)[0]
+        expected = [number for number in sequences(kept) if number > first]
+        assert expected
+        wait_for(lambda: sequences(reports)[-1] == last and sequences(events)[-len(expected) :] == expected)
+        assert subscriber.order.missed == 0
 
 
 def test_watch_prints_every_report_once_although_it_was_stopped(tmp_path: Path, start: Callable[..., Process]) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import json
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
@@ -18,6 +19,7 @@ from otolith_drivers.errors import ServiceError
 QUERY_TIMEOUT = 5.0  # s
 QUERY_TRIES = 5  # queries for what is missing
 QUERY_PAUSE = 0.5  # s between them
+QUERY_PERIOD = 10.0  # s between queries for what was lost on the way without a later message that shows it
 MAX_BEHIND = 1000  # messages that wait for on_message; later ones come from the history
 MAX_CONNECTING = 32  # endpoints that are tried at the same time
 MAX_KEYS = 1000  # of machines, of which the position is kept
@@ -197,13 +199,15 @@ class Subscriber:
             self._is_behind.set()
 
     def _run(self) -> None:
+        due = time.monotonic() + QUERY_PERIOD
         while not self._stopping.is_set():
+            if time.monotonic() >= due or (self._is_behind.is_set() and self._waiting.empty()):
+                self._is_behind.clear()
+                self._catch_up(self.order.keys)
+                due = time.monotonic() + QUERY_PERIOD
             try:
                 key, text = self._waiting.get(timeout=QUERY_PAUSE)
             except queue.Empty:
-                if self._is_behind.is_set():
-                    self._is_behind.clear()
-                    self._catch_up(self.order.keys)
                 continue
             if text is not None:
                 self._take(key, text)
