@@ -65,6 +65,8 @@ def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
     port = free_port(socket.SOCK_STREAM)
     with opcua_server(port, VALUES) as server, opened(port, tmp_path, timeout="0.5 s") as (driver, samples):
         wait_for(lambda: len(samples) > 100)
+        times = [sample.time for sample in samples if sample.signal == "i"]
+        period = max((times[-1] - times[0]) / (len(times) - 1), 0.01)  # a busy computer samples less often than asked
         server.send_signal(signal.SIGSTOP)
         wait_for(lambda: re.search("no answer|no message|does not answer", driver.link().reason) is not None)
         server.send_signal(signal.SIGCONT)
@@ -80,7 +82,7 @@ def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
     assert "ended the subscription" not in caplog.text, "the library calls a lost connection so, not the server"
     first = samples[before].time
     assert counters.reconnects == 2
-    assert counters.lost >= 0.9 * 2 * 100 * (first - gone)
+    assert counters.lost >= 0.9 * 2 * (first - gone) / period
 
 
 def test_stamps_of_a_clock_an_hour_ahead_are_refused_and_those_of_the_server_used(port: int, tmp_path: Path) -> None:
