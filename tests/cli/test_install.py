@@ -170,6 +170,14 @@ def test_readers_whose_network_is_in_a_drop_in_of_ones_own_leave_1_0(file: Path,
     assert exposure(tmp_path, "press-3") <= 1.0
 
 
+def test_readers_whose_networks_the_machine_file_names_leave_1_0(file: Path, tmp_path: Path) -> None:
+    installed(file, tmp_path)
+    text = drop_in("press-3", [{"type": "plant"}], ("tls/0.0.0.0:7447",), (), networks=("192.168.7.0/24",))
+    path = tmp_path / "etc/systemd/system/otolith@press-3.service.d/machine.conf"
+    path.write_text(text, encoding="utf-8")
+    assert exposure(tmp_path, "press-3") <= 1.0
+
+
 def test_the_service_accepts_packets_from_the_networks_of_its_readers_alone(file: Path, tmp_path: Path) -> None:
     table = '[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]\naccess = { networks = ["192.168.7.0/24", "fd00::/8"] }\n'
     file.write_text(file.read_text(encoding="utf-8") + table, encoding="utf-8")

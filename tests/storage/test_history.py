@@ -325,6 +325,19 @@ def test_a_database_that_is_damaged_while_it_is_used_is_kept(opened: Callable[..
     assert len(numbers_of(history.writer.reader)) == 3
 
 
+def test_a_database_that_readers_find_damaged_is_named_once(
+    opened: Callable[..., Simulated], path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who writes has its pages in memory, and notices nothing."""
+    history = opened()
+    history.write(*documents(3))
+    path.write_bytes(bytes(1024) + path.read_bytes()[1024:])
+    path.with_name(f"{path.name}-wal").write_bytes(b"")
+    for _ in range(3):
+        assert history.writer.messages("report", 10) == []
+    assert caplog.text.count("queries are not answered") == 1
+
+
 def test_kept_databases_take_no_more_than_a_history_and_the_newest_stays(
     opened: Callable[..., Simulated], path: Path
 ) -> None:

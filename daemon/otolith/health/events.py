@@ -25,7 +25,7 @@ from otolith.health.observations import (
     is_determined,
     observe,
 )
-from otolith.health.prognosis import History, forecast, is_due, span, with_point
+from otolith.health.prognosis import Earlier, History, forecast, is_due, span, with_clock, with_point
 from otolith.health.schema import (
     EventChange,
     EventDocument,
@@ -73,6 +73,7 @@ class HealthState:
     steps: Mapping[str, float] = field(default_factory=dict)  # Last sudden change of each parameter
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
+    earlier: Mapping[str, Earlier] = field(default_factory=dict)  # Histories from before the clock was set back
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
     undetermined: Mapping[str, float] = field(default_factory=dict)
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
@@ -89,8 +90,9 @@ class HealthState:
     def without_history(self, name: str) -> "HealthState":
         """Return the state without history and forecast of a parameter."""
         histories = {key: history for key, history in self.histories.items() if key != name}
+        earlier = {key: item for key, item in self.earlier.items() if key != name}
         forecasts = {key: item for key, item in self.forecasts.items() if key != name}
-        return replace(self, histories=histories, forecasts=forecasts)
+        return replace(self, histories=histories, earlier=earlier, forecasts=forecasts)
 
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
@@ -227,7 +229,7 @@ def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str
 
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of this window in the histories, and with the forecasts that are due."""
-    histories, forecasts = dict(state.histories), dict(state.forecasts)
+    histories, earlier, forecasts = dict(state.histories), dict(state.earlier), dict(state.forecasts)
     for name, item in report.parameters.items():
         quantity = plan.parameters.get(name)
         is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
@@ -239,10 +241,12 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
             time, value, sd = 0.5 * (report.window.start + report.window.end), item.raw, item.raw_sd
         if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
             continue
-        histories[name] = with_point(histories.get(name, ()), time, referred[0], referred[1] ** 2)
+        history, before = with_clock(histories.get(name, ()), earlier.pop(name, None), time)
+        earlier |= {} if before is None else {name: before}
+        histories[name] = with_point(history, time, referred[0], referred[1] ** 2)
         if is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(quantity, histories[name])
-    return replace(state, histories=histories, forecasts=forecasts)
+    return replace(state, histories=histories, earlier=earlier, forecasts=forecasts)
 
 
 def _advance(
@@ -325,12 +329,9 @@ def _description(
 
 
 def _states(
-    plan: MonitoringPlan,
-    before: HealthDocument | None,
-    report: ReportDocument,
-    events: Sequence[EventDocument],
+    plan: MonitoringPlan, before: HealthDocument | None, report: ReportDocument, events: Sequence[EventDocument],
     determined: Collection[str],
-) -> HealthDocument:
+) -> HealthDocument:  # fmt: skip
     """Return the states of parts and machine; ``events`` begin with the most severe.
 
     ``determined`` are the parameters that once were. Without data, all parts of the machine are at NO DATA.

@@ -215,7 +215,7 @@ class HistoryWriter(WriterThread):
         self._connection: sqlite3.Connection | None = None
         self._waiting: deque[ReportDocument] = deque()
         self._lock, self._written = threading.Lock(), threading.Event()
-        self._pruned_at = 0.0
+        self._pruned_at, self._read_error = 0.0, ""
         self.description = ""
         """As :func:`otolith.storage.history.describe_machine` returns it; it is written with the next report."""
         self.dropped = 0  # Reports that were not written
@@ -257,7 +257,9 @@ class HistoryWriter(WriterThread):
         try:
             return self.reader.messages(kind, limit, after, start, end)
         except OtolithError as error:
-            log.debug("%s", error)
+            if str(error) != self._read_error:
+                log.warning("queries are not answered: %s", error)
+            self._read_error = str(error)
             return []
 
     def write(self) -> None:

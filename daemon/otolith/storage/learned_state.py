@@ -172,7 +172,9 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         ValueError: the document is not plausible.
     """
     _require(max(map(abs, _numbers(document.model_dump())), default=0.0) <= MAX_MAGNITUDE, "a number is too large")
-    _require(all(map(is_plausible, document.health.histories.values())), "health: a history is not plausible")
+    earlier = [history for _, history in document.health.earlier.values()]
+    histories = [*document.health.histories.values(), *earlier]
+    _require(all(map(is_plausible, histories)) and all(earlier), "health: a history is not plausible")
     health = replace(document.health, forecasts={})  # their limits may have changed
     record, problem = document.filter, state.problem
     check_components(document.components, problem.base_model)
