@@ -357,7 +357,7 @@ def _set(*place: Any, value: Any) -> Callable[[dict[str, Any]], None]:
 FIRST = ("state",)
 NO_NUMBERS = {"type": "<f8", "shape": [0], "order": "C", "bits": ""}
 FORGED = {
-    "another version": _set("version", value=2),
+    "another version": _set("version", value=99),
     "no version": lambda document: document.pop("version"),
     "an unknown key": _set("unknown", value=1),
     "no windows": _set("windows", value=[]),
