@@ -15,7 +15,7 @@ from benchmarks.motor import CONFIG, windows
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem

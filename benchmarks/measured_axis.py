@@ -24,8 +24,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning.identification import identify_noise
 from otolith.discovery.search import ROUNDS, STEPS_OF_ROUND
-from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import fit

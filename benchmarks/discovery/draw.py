@@ -19,9 +19,8 @@ from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import LinearResponse, basis_functions
 from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
-from otolith.estimation.arrival_cost import Prior
-from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind
+from otolith.estimation.information import Prior
+from otolith.twin.components import COMPONENT_FAMILIES, ComponentFamily, SourceKind, sites, sources
 
 SECONDS = 2.0
 MIN_RATIO, MAX_RATIO = 3.0, 30.0  # of the detection limit

@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from benchmarks.discovery.judge import CaseResult
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES
 
 FIRST_AT_LEAST, NAMED_AT_LEAST, COVERED = 0.90, 0.98, (0.93, 0.97)
 OTHERS = ("two or more", "sensor", "parameter", "nothing")  # results that are no single component

@@ -10,7 +10,7 @@ from otolith.acquisition.window import Window
 from otolith.discovery.hypotheses import FittedHypothesis
 from otolith.discovery.screening import ScreeningResult, linearised
 from otolith.discovery.search import screening_test, search
-from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.information import Prior
 from otolith.estimation.problem import Problem
 from otolith.machine import load_machine
 

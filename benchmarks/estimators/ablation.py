@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.command_line import show_progress
 from benchmarks.estimators.cases import BOUNDS_FACTOR, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.minimisers import gauss_newton, search_parameters
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem

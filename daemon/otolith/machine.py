@@ -14,9 +14,10 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.health.diagnosis import Rule, RulesFile, worded
-from otolith.health.language import Language, texts_in
-from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan, Rule, RulesFile, worded
+from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity
+from otolith.health.schema import Language
+from otolith.health.text import texts_in
 from otolith.machine_file import (
     DiscoveryTable,
     LimitsTable,
@@ -31,8 +32,7 @@ from otolith.machine_file import (
     own_keys,
     signal_units,
 )
-from otolith.twin.augmentation import sensor_site, sites, sources
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, Sampling, sampling_of

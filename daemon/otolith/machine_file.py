@@ -15,12 +15,11 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
 from otolith.health.diagnosis import OwnRule
-from otolith.health.language import Language
+from otolith.health.schema import Language
 from otolith.twin.definition import Definition
-from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
+from otolith_drivers.base import Driver, DriverType, NamedSource, Sampling, Setup, SeveralSources, Signal, find_driver
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.several_sources import NamedSource, SeveralSources
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")

@@ -16,8 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith_drivers.modbus.plausibility import fault_of_floats
-from otolith_drivers.modbus.protocol import (
+from otolith_drivers.modbus.options import (
     BYTES_SWAPPED,
     LETTERS,
     WORDS_SWAPPED,
@@ -26,6 +25,7 @@ from otolith_drivers.modbus.protocol import (
     orders_of,
     registers_of,
 )
+from otolith_drivers.modbus.plausibility import fault_of_floats
 
 # Costs in bits. The prior of a type is roughly the negative logarithm of how common it is; the other costs are weighed
 # against it. All are engineering choices that tests/drivers/test_number_inference.py guards as a set.

@@ -11,8 +11,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.estimation.problem import Problem
-from otolith.health.diagnosis import FindingKind
-from otolith.health.schema import ReportDocument, Status
+from otolith.health.schema import FindingKind, ReportDocument, Status
 from otolith.machine import find_twin
 
 MOTOR = find_twin("dc_motor")

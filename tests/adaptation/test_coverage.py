@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Search, estimate

@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.window import Array, BridgeError, Quality, TimeGrid, Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import MAX_CHANGE, Problem, WindowOptions
 from otolith.estimation.window_fit import Search, estimate

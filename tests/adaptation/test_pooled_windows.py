@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
-from otolith.adaptation import adapt as module
-from otolith.adaptation.adapt import MAX_PAUSE, MAX_WINDOWS, adapt, pooled_with
-from otolith.adaptation.pooled_windows import PooledWindows
+from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.commissioning.structure import Structure
+from otolith.commissioning import structure as module
+from otolith.commissioning.structure import MAX_PAUSE, MAX_WINDOWS, PooledWindows, Structure, pooled_with
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, fit
 from otolith.health.schema import ReportDocument

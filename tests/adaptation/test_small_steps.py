@@ -11,8 +11,8 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation.information import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument

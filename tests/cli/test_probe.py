@@ -24,8 +24,7 @@ from otolith_drivers.canbus.driver import Options as CanOptions
 from otolith_drivers.canbus.driver import Source as CanSource
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.modbus.driver import Options, Source
-from otolith_drivers.modbus.options import register_signal
-from otolith_drivers.modbus.protocol import Order, TypeName
+from otolith_drivers.modbus.options import Order, TypeName, register_signal
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
 from tests.drivers.registers import registers

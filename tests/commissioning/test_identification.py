@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Array, Quality, TimeGrid, Verdict, Window
 from otolith.commissioning import identification as text
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states, sample_noise
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
 from otolith.machine import find_twin

@@ -10,8 +10,7 @@ from benchmarks.changes.plants import HEALTHY, Plant
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import identify_noise
 from otolith.commissioning.structure import remaining_structure
-from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
 

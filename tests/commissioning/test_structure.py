@@ -13,9 +13,9 @@ from otolith.commissioning.likelihood import Likelihood, with_levels
 from otolith.commissioning.structure import PooledResponse, Structure, remaining_structure
 from otolith.discovery.candidates import best_guesses
 from otolith.discovery.screening import ScoredGuess, allowed_forms
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.window_fit import fit
-from otolith.twin.augmentation import sources
+from otolith.twin.components import sources
 from tests.cogging_axis import AMPLITUDE, FREE, PITCH, PROBLEM, TRUTH, record
 
 

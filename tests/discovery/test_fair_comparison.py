@@ -26,7 +26,7 @@ from otolith.discovery.hypotheses import (
     with_candidate,
 )
 from otolith.discovery.search import fit_hypotheses
-from otolith.estimation.arrival_cost import Prior, forget_parameter, initial_prior
+from otolith.estimation.information import Prior, forget_parameter, initial_prior
 from otolith.estimation.problem import Component, Problem
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of

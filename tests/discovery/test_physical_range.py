@@ -16,10 +16,9 @@ from otolith.discovery.candidates import best_guesses, find_candidates
 from otolith.discovery.linear_response import LinearResponse
 from otolith.discovery.screening import ScoredGuess, candidate_library, linearised
 from otolith.discovery.search import search
-from otolith.estimation.arrival_cost import Prior, initial_prior
+from otolith.estimation.information import Prior, initial_prior
 from otolith.machine import find_twin
-from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, SourceKind
+from otolith.twin.components import COMPONENT_FAMILIES, SourceKind, sites, sources
 from otolith.twin.symbolic import system_of
 from tests.discovery.two_mass import DryFriction, simulate
 from tests.discovery.two_mass import problem as two_mass_problem

@@ -30,7 +30,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate_window
 from otolith.machine import find_twin
-from otolith.twin.component_families import family_code
+from otolith.twin.components import family_code
 from otolith.twin.definition import Role
 from otolith.twin.kernel import Excitation, kernel_of
 

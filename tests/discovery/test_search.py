@@ -24,7 +24,7 @@ from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
-from otolith.twin.augmentation import sites, sources
+from otolith.twin.components import sites, sources
 from tests.variants import often
 
 TWIN = find_twin("dc_motor")

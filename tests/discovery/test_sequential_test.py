@@ -15,7 +15,7 @@ from otolith.discovery.hypotheses import (
     without_insignificant,
 )
 from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
-from otolith.estimation.arrival_cost import Evidence, Prior
+from otolith.estimation.information import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment
 from otolith.machine import find_twin

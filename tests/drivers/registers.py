@@ -3,8 +3,15 @@
 import struct
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
-from otolith_drivers.modbus.protocol import LETTERS, Order, TypeName
+from otolith_drivers.modbus.options import (
+    LETTERS,
+    ModbusOptions,
+    ModbusSource,
+    Order,
+    RegisterSignal,
+    TypeName,
+    register_signal,
+)
 
 KINDS: list[TypeName] = list(LETTERS)
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from otolith_drivers.modbus.options import LineOptions
+from otolith_drivers.modbus.options import ORDERS, LineOptions, Order, TypeName, is_float, orders_of
 from otolith_drivers.modbus.probe import Block, Number, Place, Words, modbus_signal_lines, numbers_of
-from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
 from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers
 

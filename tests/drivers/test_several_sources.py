@@ -15,10 +15,9 @@ from otolith.estimation.information import Identifiability
 from otolith.health.schema import ParameterDocument, Status
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
-from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
+from otolith_drivers.base import Counters, Deliver, Driver, Link, NamedSource, Sample, Sampling, SeveralSources
 from otolith_drivers.conformance import CONTRACT, Rig
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.several_sources import NamedSource, SeveralSources
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import RIGS
 from tests.waiting import PATIENCE, wait_for, within

@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.estimation import imm_filter
-from otolith.estimation.arrival_cost import Evidence
+from otolith.estimation.information import Evidence
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin

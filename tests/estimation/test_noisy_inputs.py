@@ -8,8 +8,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
 from tests.noisy_axis import TRUTH, WINDOWS, recorded

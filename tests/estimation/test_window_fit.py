@@ -10,8 +10,7 @@ from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.information import Identifiability, inflation_of
+from otolith.estimation.information import Identifiability, inflation_of, initial_prior
 from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem, SwarmOptions
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate

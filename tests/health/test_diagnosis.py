@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 
-from otolith.health.diagnosis import KEYS, FindingFeatures, FindingKind, Rule, diagnose, matching, severity
+from otolith.health.diagnosis import KEYS, FindingFeatures, Rule, diagnose, matching, severity
+from otolith.health.schema import FindingKind
 from otolith.machine import find_twin, library_twins, load_rules
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES
 
 RULES = load_rules()
 TWINS = {name: find_twin(name) for name in library_twins()}

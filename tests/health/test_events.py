@@ -9,9 +9,9 @@ import pytest
 
 from otolith.acquisition.window import Verdict
 from otolith.discovery.decision import Approval, WindowDecision
-from otolith.health.diagnosis import FindingKind
+from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState, assess
-from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan
+from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity
 from otolith.health.observations import (
     INTERMITTENT_WINDOWS,
     LOST_AFTER,
@@ -25,6 +25,7 @@ from otolith.health.schema import (
     EventChange,
     EventDocument,
     FindingDocument,
+    FindingKind,
     NumberDocument,
     ParameterDocument,
     QualityDocument,

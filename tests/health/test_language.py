@@ -17,12 +17,11 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.cli.operation.live_table import LiveTable
-from otolith.health import language as module
-from otolith.health.language import LANGUAGES, Language, texts_in
+from otolith.health import text as module
 from otolith.health.limits import MACHINE, Level
 from otolith.health.observations import BUS, SENSORS
-from otolith.health.schema import CountersDocument, ReportDocument
-from otolith.health.text import announcements, event_text, headline
+from otolith.health.schema import LANGUAGES, CountersDocument, Language, ReportDocument
+from otolith.health.text import announcements, event_text, headline, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
 from otolith.publishing.html_report import html_report
 from otolith.publishing.recorder import blueprint, operator_text, report_text

@@ -3,10 +3,9 @@
 import pytest
 
 from otolith.discovery.decision import WindowDecision
-from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.observations import MIN_RETURNS, PERSISTENT_WINDOWS, RELEASE_WINDOWS
-from otolith.health.schema import EventChange
+from otolith.health.schema import EventChange, FindingKind
 from tests.health.test_events import LENGTH, NOMINAL, SENSOR, assessed, changes, events, report, sensor_reports
 
 

@@ -3,7 +3,6 @@
 import pytest
 
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.schema import (
     DriverDocument,
@@ -11,6 +10,7 @@ from otolith.health.schema import (
     EventDocument,
     EvidenceDocument,
     FindingDocument,
+    FindingKind,
     HealthDocument,
     ParameterDocument,
     PartDocument,

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from otolith.cli.commissioning.check import describe
-from otolith.health.diagnosis import FindingFeatures, FindingKind, diagnose
-from otolith.health.limits import Level, MonitoringPlan
+from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, diagnose
+from otolith.health.limits import Level
+from otolith.health.schema import FindingKind
 from otolith.machine import LIBRARY, load_machine, load_rules
 from otolith.publishing.zenoh_config import listening
 from otolith_drivers.errors import ConfigurationError, OtolithError

@@ -12,9 +12,9 @@ import pytest
 from benchmarks.browser import Browser, browser, program
 
 from benchmarks import pictures
-from otolith.health.language import texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
+from otolith.health.text import texts_in
 from otolith.publishing.html_report import MAX_ROWS, Axis, html_report
 from otolith.storage.history import DAY, HOUR, WINDOW, HistoryReader, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter

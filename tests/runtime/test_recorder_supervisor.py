@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from otolith.machine import LoadedMachine, load_machine
-from otolith.runtime.recorder_supervisor import RECORDER_TIMEOUT, RecorderSupervisor
+from otolith.runtime.process import RECORDER_TIMEOUT, RecorderSupervisor
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.replay.recording import RecordingReader
 from tests.conftest import EXAMPLES

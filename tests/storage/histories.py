@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 from otolith.acquisition.window import Verdict
 from otolith.discovery.decision import WindowDecision
-from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.schema import (
     CountersDocument,
@@ -12,6 +11,7 @@ from otolith.health.schema import (
     EventDocument,
     EvidenceDocument,
     FindingDocument,
+    FindingKind,
     ParameterDocument,
     QualityDocument,
     ReportDocument,

@@ -26,9 +26,8 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, initial_state
 from otolith.cli.main import cli
-from otolith.health.diagnosis import FindingFeatures, FindingKind, diagnose
-from otolith.health.limits import MonitoringPlan
-from otolith.health.schema import EventChange, Report
+from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, diagnose
+from otolith.health.schema import EventChange, FindingKind, Report
 from otolith.machine import load_machine
 from otolith.runtime.worker import Supervisor
 from otolith.storage import evidence

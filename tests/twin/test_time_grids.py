@@ -8,7 +8,7 @@ import pytest
 
 from otolith.acquisition.window import Array, TimeGrid
 from otolith.machine import find_twin
-from otolith.twin.augmentation import augmented_model
+from otolith.twin.components import augmented_model
 from otolith.twin.kernel import Excitation, InnovationModel, NoiseModel, kernel_of
 
 TWIN = find_twin("dc_motor")  # V_a is held between records, T_load runs straight to the next

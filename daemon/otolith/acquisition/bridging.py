@@ -13,8 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from otolith.acquisition.alignment import Indices
-from otolith.acquisition.samples import Interval, Series, SignalPlan
+from otolith.acquisition.samples import Indices, Interval, Series, SignalPlan
 from otolith.acquisition.window import Array, BridgeError
 from otolith_drivers.base import Sampling
 

@@ -8,9 +8,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from otolith.acquisition.alignment import CyclicSeries
 from otolith.acquisition.records import Records
-from otolith.acquisition.samples import SignalPlan
+from otolith.acquisition.samples import CyclicSeries, SignalPlan
 from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.

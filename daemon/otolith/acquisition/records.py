@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from otolith.acquisition.alignment import Indices
 from otolith.acquisition.bridging import (
     BridgedInput,
     InputKind,
@@ -21,7 +20,7 @@ from otolith.acquisition.bridging import (
     kind_of,
     lost_samples,
 )
-from otolith.acquisition.samples import Check, Interval, Series, SignalPlan, interval_of, stale_repeats
+from otolith.acquisition.samples import Check, Indices, Interval, Series, SignalPlan, interval_of, stale_repeats
 from otolith.acquisition.window import Array, BridgeError, GridSpan, Mask, TimeGrid
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.

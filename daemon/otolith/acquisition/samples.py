@@ -1,11 +1,20 @@
-"""The samples of one signal, cleaned: in order, one for each time, without stale repeats; and how often they come."""
+"""The samples of one signal: cleaned, how often they come, and at the times of the clock that took them.
 
-from dataclasses import dataclass
+Cleaned, they are in order, one for each time, without stale repeats.
+
+A source of cyclic signals samples on a clock of its own; only the arrival jitters, late but never early. A signal whose
+period is that of the grid of the window is assigned to the slots of the grid: late samples move to earlier slots, and
+values are not changed. A signal with another period has slots of its own, whose times are estimated from the arrivals;
+they are slots of the grid if that period is a whole multiple of the grid's. Nothing is interpolated.
+"""
+
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
-from otolith.acquisition.window import Array, Mask
+from otolith.acquisition.window import Array, GridSpan, Mask
 from otolith_drivers.base import Sampling
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
@@ -21,6 +30,19 @@ LOST_INTERVAL = 1.5  # usual intervals above which a sample of a clock is lost
 MIN_STALE_RUNS = 10  # runs of equal values that show how often a register is renewed
 STALE_SHARE = 0.8  # of these runs that must be equally long
 COARSE_STEPS = 2.0  # least steps by which a coarse sensor usually moves: then equal values are measurements
+SAME_PERIOD = 0.02  # share by which the mean interval of a signal may differ from the period of the grid
+MEDIAN_SD = 1.2533  # standard deviation of a median over that of the mean, for normal deviates
+MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+PERIOD_DEVIATIONS = 4.0  # standard deviations by which the median interval may differ from the period of the grid
+MAX_DROPPED_SAMPLES = 20  # surplus samples per window that are dropped; more of them show as jitter
+PUNCTUAL_QUANTILE = 0.1  # of lateness: stands for the samples that the computer's load did not delay
+MAX_CLOCK_JITTER = 0.25  # of its period: standard deviation of the arrivals about a clock, above which there is none
+MAX_PHASE_ERROR = 0.05  # sample periods by which a delayed signal may be off the grid and still count as on it
+MIN_CLOCK_SAMPLES = 4  # samples from which the clock of a signal with another period can be estimated
+MAX_CLOCK_SLOTS = 100  # per sample: with more of them the arrivals have no clock
+LAG_DEVIATIONS = 3.0  # standard deviations by which neighbouring intervals must be correlated to show a second sender
+
+Indices = NDArray[np.int64]
 
 
 class Check(StrEnum):
@@ -154,3 +176,162 @@ def interval_of(times: Array) -> Interval:
             return Interval(usual, LOST_INTERVAL * usual)
     long = float(np.quantile(intervals, LONG_QUANTILE))
     return Interval(float(np.median(intervals)), LONG_FACTOR * long)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CyclicSeries:
+    """The samples of a cyclic signal at the times of its clock."""
+
+    series: Series
+    lateness: Array  # Arrival of each sample minus the time of its slot, s
+    on_grid: bool  # Whether the slots are those of the grid of the window
+    surplus: int = 0  # Samples dropped because there was no slot for them
+    irregularity: float = 0.0
+    """Standard deviation of the interval over its mean, of a signal with a period of its own; zero if samples were lost
+    at random only."""
+
+
+def has_period(times: Array, period: float) -> bool:
+    """Whether samples that arrive at ``times`` (n,), s, come every ``period`` s, some lost and some late."""
+    intervals = np.diff(times)
+    if not len(intervals):
+        return True
+    if abs(float(intervals.mean()) / period - 1.0) <= SAME_PERIOD:
+        return True
+    median = float(np.median(intervals))
+    spread = MAD_TO_SD * float(np.median(np.abs(intervals - median)))
+    allowed = max(SAME_PERIOD * period, PERIOD_DEVIATIONS * MEDIAN_SD * spread / np.sqrt(len(intervals)))
+    return bool(abs(median - period) <= allowed)
+
+
+def align(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples of a cyclic signal in the slots ``start + k * period``, or in slots of its own.
+
+    A sample belongs to the slots of the window if it comes from ``grace`` s before until ``grace`` s after it. The
+    lateness is that of the slots ``k < records``. The other samples keep their times.
+    """
+    if not has_period(samples.within(span.start - grace, span.end + grace).times, span.period):
+        return _own_clock(samples, span, grace)
+    return align_to_grid(samples, span, grace)
+
+
+def align_delayed(
+    samples: Series, delay: float, span: GridSpan, grace: float, arrivals: Array | None = None
+) -> CyclicSeries:
+    """Return the samples of a cyclic signal at the times of their arrival, without lateness, minus ``delay`` (s).
+
+    Slots of the grid would take away a part of the delay: that by which this signal arrives later than the others. The
+    lateness beyond the delay stays, so that the grid can follow the clock of the source. ``arrivals`` are the times of
+    all signals with the clock of this one, if there are others.
+    """
+    phase = _arrival_phase(samples.times if arrivals is None else arrivals, span)
+    slots = round((delay - phase) / span.period)
+    own = replace(span, start=span.start + phase + slots * span.period)
+    aligned = align(samples, own, grace)
+    times = aligned.series.times - delay
+    off_grid = own.start - delay - span.start
+    if not aligned.on_grid or abs(off_grid) > MAX_PHASE_ERROR * span.period:
+        return replace(aligned, series=Series(times, aligned.series.values), on_grid=False)
+    series = Series(times - off_grid, aligned.series.values)
+    return replace(aligned, series=series, lateness=aligned.lateness + off_grid)
+
+
+def _arrival_phase(times: Array, span: GridSpan) -> float:
+    """Return when the punctual samples arrive after the slots of the grid, s: between zero and a period."""
+    if not len(times):
+        return 0.0
+    turns = (times - span.start) / span.period
+    middle = float(np.angle(np.exp(2j * np.pi * turns).mean())) / (2.0 * np.pi)
+    deviations = (turns - middle + 0.5) % 1.0 - 0.5
+    return (middle + float(np.quantile(deviations, PUNCTUAL_QUANTILE))) % 1.0 * span.period
+
+
+def align_to_grid(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples of a signal in the slots ``start + k * period``, as :func:`align` does."""
+    start, period = span.start, span.period
+    near = samples.within(start - grace, span.end + grace)
+    kept, slots = _assign_slots(near.times, np.rint((near.times - start) / period))
+    at: Array = np.asarray(start + slots * period)
+    inside = (slots >= 0) & (slots < span.records)
+    before = samples.within(-np.inf, min(start - grace, float(at[0]) if len(at) else np.inf))
+    after = samples.within(max(span.end + grace, float(at[-1]) + period / 2 if len(at) else -np.inf), np.inf)
+    series = merge_equal_times(  # those before and after the window may have equal times
+        np.concatenate([before.times, at, after.times]),
+        np.concatenate([before.values, near.values[kept], after.values]),
+        "zoh",
+    )
+    surplus = len(near.times) - len(kept)
+    return CyclicSeries(series, (near.times[kept] - at)[inside], on_grid=True, surplus=surplus)
+
+
+def _own_clock(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples in slots whose period and phase are estimated from the arrivals.
+
+    Where the arrivals are too irregular for a clock, each sample keeps the time of its arrival.
+    """
+    times, values, irregularity = samples.times, samples.values, irregularity_of(samples.times)
+    last_of_each = merge_equal_times(times, values, "zoh")
+    as_arrived = CyclicSeries(last_of_each, np.zeros(0), on_grid=False, irregularity=irregularity)
+    if len(last_of_each.times) < MIN_CLOCK_SAMPLES:
+        return as_arrived
+    nearest = np.rint(np.diff(times, prepend=times[0]) / interval_of(last_of_each.times).usual).cumsum()
+    for _ in range(2):  # from interval to interval, then on the clock that this gives
+        if float(np.abs(nearest).max()) > MAX_CLOCK_SLOTS * len(times):
+            return as_arrived
+        kept, slots = _assign_slots(times, nearest)
+        if len(kept) < MIN_CLOCK_SAMPLES:
+            return as_arrived
+        arrivals, slots = times[kept], slots - slots[0]
+        period, start = (float(number) for number in np.polyfit(slots, arrivals, 1))
+        if period <= 0.0:
+            return as_arrived
+        nearest = np.rint((times - start) / period)
+    lateness = arrivals - (start + slots * period)
+    if float(lateness.std()) > MAX_CLOCK_JITTER * period:
+        return as_arrived
+    start += float(np.quantile(lateness, PUNCTUAL_QUANTILE))
+    multiple = round(period / span.period)
+    on_grid = multiple > 0 and abs(period / (multiple * span.period) - 1.0) * float(slots[-1]) * multiple < 0.5
+    if on_grid and multiple == 1:
+        return align_to_grid(samples, span, grace)
+    if on_grid:
+        slots = round((start - span.start) / span.period) + slots * multiple
+        start, period = span.start, span.period
+    at: Array = np.asarray(start + slots * period)
+    return CyclicSeries(Series(at, values[kept]), arrivals - at, on_grid, len(times) - len(kept), irregularity)
+
+
+def irregularity_of(times: Array) -> float:
+    """Return the standard deviation of the intervals between ``times`` (n,) over their mean.
+
+    It is zero if neighbouring intervals are independent, as where samples are lost at random. With a second sender, or
+    with late samples, a short interval follows a long one.
+    """
+    intervals = np.diff(times)
+    count, deviations = len(intervals), intervals - intervals.mean() if len(intervals) else intervals
+    variance = float(np.mean(deviations**2)) if count else 0.0
+    if count < 2 or variance <= 0.0:
+        return 0.0
+    correlation = float(np.sum(deviations[1:] * deviations[:-1])) / (count * variance)
+    alternating = correlation < -LAG_DEVIATIONS / np.sqrt(count)
+    return float(np.sqrt(variance) / intervals.mean()) if alternating else 0.0
+
+
+def _assign_slots(times: Array, nearest: Array) -> tuple[Indices, Indices]:
+    """Return the indices of the samples to keep, and the slot of each; ``nearest`` is the slot nearest to each sample.
+
+    A sample takes the nearest slot, or an earlier one where several came in a burst. If the samples of a burst find no
+    free slot before them, one sample is surplus: the one closest to its predecessor is dropped. After
+    ``MAX_DROPPED_SAMPLES`` dropped samples the rest keep their late slots.
+    """
+    kept, wanted = np.arange(len(times)), nearest.astype(np.int64)
+    for droppable in range(MAX_DROPPED_SAMPLES, -1, -1):
+        order = np.arange(len(kept))
+        slots = np.minimum.accumulate((wanted[kept] - order)[::-1])[::-1] + order
+        moved = wanted[kept] > slots
+        if not len(kept) or not moved[0] or not droppable:
+            break
+        burst = len(moved) if moved.all() else int(np.argmin(moved))
+        surplus = int(np.argmin(np.diff(times[kept][: burst + 1]))) + 1 if burst > 0 and len(kept) > 1 else 0
+        kept = np.delete(kept, surplus)
+    return kept, slots

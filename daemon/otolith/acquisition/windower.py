@@ -6,18 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.alignment import (
-    PUNCTUAL_QUANTILE,
-    CyclicSeries,
-    align,
-    align_delayed,
-    align_to_grid,
-    has_period,
-)
 from otolith.acquisition.quality import QualityLimits, assess_quality
 from otolith.acquisition.records import EARLY, ON_GRID, lies_on_grid, make_records, phase_of_grid
 from otolith.acquisition.ring import Rings
-from otolith.acquisition.samples import Series, SignalPlan, finite_samples, has_equal_times, merge_equal_times
+from otolith.acquisition.samples import (
+    PUNCTUAL_QUANTILE,
+    CyclicSeries,
+    Series,
+    SignalPlan,
+    align,
+    align_delayed,
+    align_to_grid,
+    finite_samples,
+    has_equal_times,
+    has_period,
+    merge_equal_times,
+)
 from otolith.acquisition.window import Array, GridSpan, Window
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.

@@ -10,9 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.pooled_windows import PooledWindows, lacking_component
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
@@ -21,7 +19,7 @@ from otolith.adaptation.state import (
     with_posterior,
     with_records,
 )
-from otolith.commissioning.structure import MIN_WINDOWS
+from otolith.commissioning.structure import PooledWindows, pooled_with
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -42,23 +40,23 @@ from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
 from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
 from otolith.estimation.imm_filter import Innovation, ParameterCusum
-from otolith.estimation.information import QUANTILE, Identifiability, information
-from otolith.estimation.objective import EXPLAINED, Objective
+from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of, source_of
+from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
 from otolith.estimation.timing import with_changes_between
-from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate, estimate_window, fit_predicted
+from otolith.estimation.window_fit import (
+    Search,
+    WindowEstimate,
+    estimate,
+    estimate_window,
+    fit_predicted,
+    unbridged_gap,
+)
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
-from otolith.twin.augmentation import positions
 
 UNUSED = "nothing is estimated from this window: "
-# Thresholds of the windows that are searched together: docs/reference/thresholds-health.md.
-MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # how many, and records of all of them
-MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
-SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
-MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named; engineering choice
 
 
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
@@ -264,33 +262,6 @@ def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult)
     return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
 
 
-def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> PooledWindows:
-    """Return ``pooled`` with the window of a fit; ``parameters`` (free,) are known after it.
-
-    What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
-    """
-    pause, problem = pooled.pause - 1, fitted.problem
-    if not positions(problem.base_model):
-        return pooled
-    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
-    if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
-        return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
-    states = fitted.initial[: len(problem.base_model.states)]
-    start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
-    windows = (*pooled.windows, start)[-MAX_WINDOWS:]
-    while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
-        windows = windows[1:]
-    if pause > 0 or len(windows) < MIN_WINDOWS:
-        return replace(pooled, windows=windows, pause=pause)
-    shown, before = lacking_component(problem, windows), pooled.shown
-    if shown is not None and before is not None and shown.component.key == before.component.key:
-        one, other = shown.component.inner, before.component.inner
-        if abs(one - other) <= SAME_INNER * abs(one):
-            return PooledWindows(confirmed=shown)
-    longer = min(2 * pooled.next_pause, MAX_PAUSE)
-    return PooledWindows(windows, pooled.next_pause if shown is None else 1, longer, shown)
-
-
 def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
     """Return the result of a window that, with those before, shows a change of the parameters at ``moved``.
 
@@ -400,47 +371,3 @@ def _next_records(state: AdaptationState, result: WindowResult) -> int:
     excitation = WindowExcitation(sd, trend, estimated.cost <= EXPLAINED)
     period = window.grid.period or problem.window.sample_period or window.sample_period
     return next_records(problem.window, window.grid.length, period, excitation)
-
-
-def unbridged_gap(estimated: WindowEstimate) -> str:
-    """Return which gap makes the window of an estimate useless, and the remedy; empty if none does.
-
-    Outputs that are missing cost information, and the intervals show it. An input that is missing drives the twin in an
-    unknown way; the variance of its bridge becomes process noise. If that noise is the only reason why a window
-    determines no parameter, the window is refused and the gap is named.
-    """
-    window, problem = estimated.fit.window, estimated.fit.problem
-    error = window.bridge_error
-    if error is None or not error.held_variance.any():
-        return ""
-    if any(item.identifiability is Identifiability.DETERMINED for item in estimated.parameters):
-        return ""
-    gaps = {
-        source.name: _longest_uncertain_gap(window, source.name)
-        for source in problem.twin.inputs
-        if source.name in window.signals
-    }
-    name = max(gaps, key=lambda name: gaps[name].length, default="")
-    if not name or gaps[name].length < MIN_GAP_SHARE * window.grid.length or not _determines_without(estimated):
-        return ""
-    where = f"{name} has no sample for {gaps[name].length:.4g} s from {time_text(gaps[name].start)}"
-    remedy = "look at its source, or accept less with [estimation] determined_within"
-    return f"{where}, and no parameter can be determined within what is asked for: {remedy}"
-
-
-def _longest_uncertain_gap(window: Window, name: str) -> Gap:
-    """Return the longest time without a sample in which the input is uncertain."""
-    uncertain = window.missing_in(name)
-    if window.bridge_error is not None:
-        uncertain = uncertain & (window.bridge_error.held_variance[:, window.signals.index(name)] > 0.0)
-    return longest_gap(~uncertain, window.grid, window.start, window.sample_period)
-
-
-def _determines_without(estimated: WindowEstimate) -> bool:
-    """Whether the window would determine a parameter if all inputs were known."""
-    problem, parameters = estimated.fit.problem, estimated.fit.parameters
-    known = replace(estimated.fit.window, bridge_error=None)
-    objective = Objective(problem, known, parameters)
-    _, jacobian = objective.linearise(objective.guess(parameters))
-    sd = information(jacobian, objective.high - objective.low, 1.0).sd[: objective.free]
-    return bool((QUANTILE * sd <= problem.determined_within * problem.scale).any())

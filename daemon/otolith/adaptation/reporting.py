@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.pooled_windows import PooledWindows
 from otolith.adaptation.state import AdaptationState
+from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.decision import (
     ACCEPTED,
     COMPONENT_PROBABILITY,
@@ -22,21 +22,20 @@ from otolith.discovery.decision import (
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_sensors
 from otolith.discovery.sequential_test import SequentialTest
-from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of
 from otolith.estimation.window_fit import WindowEstimate
-from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import (
     AlternativeDocument,
     ComponentDocument,
     ComponentStatus,
     CostDocument,
     FindingDocument,
+    FindingKind,
     FitDocument,
     NumberDocument,
     ParameterDocument,
@@ -54,7 +53,7 @@ from otolith.health.status import (
     publish,
     some_parameter_is_determined,
 )
-from otolith.twin.component_families import SourceKind
+from otolith.twin.components import SourceKind
 from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other

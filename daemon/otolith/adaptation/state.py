@@ -5,15 +5,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.adaptation.pooled_windows import PooledWindows
-from otolith.commissioning.structure import Structure
+from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD, Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions, augment, indices, slot_of, without
+from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState
-from otolith.health.limits import MonitoringPlan
 from otolith.health.prognosis import Baseline, with_baselines
 from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus

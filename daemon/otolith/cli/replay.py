@@ -17,8 +17,7 @@ from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_d
 from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
 from otolith.discovery.decision import WindowDecision
-from otolith.health.diagnosis import FindingKind
-from otolith.health.schema import EventDocument, ReportDocument, Status
+from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
 from otolith.health.text import component_text, event_text, finding_text, headline, value_cells
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines

@@ -27,8 +27,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood
-from otolith.estimation.arrival_cost import eliminate_states
-from otolith.estimation.information import orthonormal_basis
+from otolith.estimation.information import eliminate_states, orthonormal_basis
 from otolith.twin.definition import Input
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.

@@ -1,15 +1,21 @@
-"""Structure in the innovations of a healthy record: components that the twin lacks in all of its windows.
+"""Components that no window shows alone, but several together: of a healthy record, or the last ones of a running twin.
 
 Process noise can be made so large that the windows fit, whatever the twin lacks. So the innovations at the likeliest
 levels are searched for structure before any level is enlarged. The windows are pooled: all have the same parameters and
 the same component, so that much weaker components show than in one window, and nothing that comes in a single window
 does. The amplitudes of the windows must agree, which those of coloured noise do only by chance.
 ``docs/explanation/noise-identification.md`` has the equations.
+
+A weak component gains too little in one window to be worth a search, however often it returns. So the last windows that
+the twin explains are kept (:class:`PooledWindows`) and from time to time searched together: same component, and
+parameters that differ from what was known by the same amount in all windows. It is adopted when two such searches find
+it. The second one contains a window that the first one has not seen. ``docs/explanation/discovery.md`` has the rules.
 """
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -18,7 +24,7 @@ from otolith.commissioning.consistency import regimes, sqrt_information
 from otolith.commissioning.identification import IdentifiedNoise, usable_windows
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
 from otolith.discovery.candidate_forms import CandidateForm
-from otolith.discovery.candidates import best_guesses
+from otolith.discovery.candidates import best_guesses, components_of
 from otolith.discovery.linear_response import (
     BasisFunctions,
     Guess,
@@ -27,15 +33,14 @@ from otolith.discovery.linear_response import (
     ScoreStatistics,
     basis_functions,
 )
-from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, allowed_forms
-from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.information import orthonormal_basis
+from otolith.discovery.noise_hypothesis import likelier_levels
+from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
+from otolith.estimation.information import initial_prior, orthonormal_basis
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
-from otolith.estimation.problem import Component, Problem
+from otolith.estimation.problem import Component, Problem, key_of, source_of
 from otolith.estimation.window_fit import Fit, fit
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import SourceKind
+from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
@@ -50,6 +55,12 @@ MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the be
 SHORTEST = 1e-300  # of a source within a window: the frequency of a sine in it stays finite
 ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
 AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
+MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # of a running twin that are searched together, and records of all of them
+MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
+SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
+
+Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]
+"""Windows, each with its initial state and with what was known of the parameters after it: they may drift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,3 +381,93 @@ def _amplitude_sd(values: Array, information: Array) -> float | None:
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:
     return any(abs(value - bound) <= AT_BOUND * abs(bound) for bound in bounds)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledWindows:
+    """The last windows that updated the filter and showed nothing that the twin lacks."""
+
+    windows: Starts = ()
+    pause: int = MIN_WINDOWS  # Windows until the next search
+    next_pause: int = MIN_WINDOWS  # The same after it
+    shown: Structure | None = None  # By the last search
+    confirmed: Structure | None = None  # By the last two: it is to be adopted
+
+
+def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> PooledWindows:
+    """Return ``pooled`` with the window of a fit; ``parameters`` (free,) are known after it.
+
+    What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
+    """
+    pause, problem = pooled.pause - 1, fitted.problem
+    if not positions(problem.base_model):
+        return pooled
+    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
+    if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
+        return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
+    states = fitted.initial[: len(problem.base_model.states)]
+    start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
+    windows = (*pooled.windows, start)[-MAX_WINDOWS:]
+    while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
+        windows = windows[1:]
+    if pause > 0 or len(windows) < MIN_WINDOWS:
+        return replace(pooled, windows=windows, pause=pause)
+    shown, before = lacking_component(problem, windows), pooled.shown
+    if shown is not None and before is not None and shown.component.key == before.component.key:
+        one, other = shown.component.inner, before.component.inner
+        if abs(one - other) <= SAME_INNER * abs(one):
+            return PooledWindows(confirmed=shown)
+    longer = min(2 * pooled.next_pause, MAX_PAUSE)
+    return PooledWindows(windows, pooled.next_pause if shown is None else 1, longer, shown)
+
+
+def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
+    """Return the component that ``windows`` show together most clearly, within its physical range; None if none.
+
+    Noise that was stated larger than it is hides structure, so likelier levels are searched at. But what the
+    stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
+    """
+    response_at = cache(lambda levels: _pooled(levels, windows))
+    quieter = likelier_levels(problem, lambda levels: _deviance(response_at(levels)))
+    pooled = response_at(quieter)
+    at_positions = positions(problem.base_model)
+    forms = [form for form in pooled_forms(pooled) if form.source in at_positions]
+    for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):
+        guess = next(form for form in forms if _key(pooled, form) == shown.component.key), shown.component.inner
+        alone, stated = (_pooled(levels, windows) for levels in (quieter, problem))
+        scored = ScoredGuesses.of(stated, [guess], CompetingForms.among(problem, forms))[0]
+        is_shown = scored.score > DECISIVE or alone.is_line(scored)
+        if (
+            is_shown
+            and not _may_be_of_sensor(alone, guess)
+            and all(components_of(own, [scored]) for own in stated.parts)
+        ):
+            return shown
+    return None
+
+
+def _pooled(problem: Problem, windows: Starts) -> PooledResponse:
+    """Return the response of the windows, each linearised at what was known of the parameters after it."""
+    prior, trends = initial_prior(problem), np.zeros(len(problem.free))
+    starts = ((window, state, np.concatenate([parameters, trends])) for window, state, parameters in windows)
+    return PooledResponse([fit(problem, window, prior, start, 0, state=state) for window, state, start in starts])
+
+
+def _deviance(pooled: PooledResponse) -> float:
+    """Minus twice the log-likelihood of the process noise, up to a constant."""
+    return pooled.chi_square + sum(part.objective.innovation_model.log_determinant for part in pooled.parts)
+
+
+def _key(pooled: PooledResponse, form: CandidateForm) -> str:
+    twin = pooled.problem.base_model
+    return key_of(sites(twin)[form.site].name, form.model.name, sources(twin)[form.source].name)
+
+
+def _may_be_of_sensor(pooled: PooledResponse, guess: Guess) -> bool:
+    """Whether the error of an output's sensor would explain the windows as well, as that of an encoder."""
+    (form, inner), twin = guess, pooled.problem.base_model
+    outputs = {output.name for output in twin.outputs}
+    read = [at for at, site in enumerate(sites(twin)) if at >= len(twin.sites) and site.into in outputs]
+    of_sensors = [(form._replace(site=at), inner) for at in read]
+    gains = pooled.score([guess, *of_sensors]).gain
+    return bool((gains[1:] > gains[0] - DECISIVE).any())

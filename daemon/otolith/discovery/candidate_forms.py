@@ -15,8 +15,16 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.estimation.problem import UNLIMITED, key_of
-from otolith.twin.augmentation import ComponentSource, augmented_model, sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
+from otolith.twin.components import (
+    COMPONENT_FAMILIES,
+    ComponentFamily,
+    ComponentSource,
+    SourceKind,
+    augmented_model,
+    family_code,
+    sites,
+    sources,
+)
 from otolith.twin.definition import Definition
 from otolith.twin.expressions import evaluate, names_in, parse, terms
 from otolith.twin.kernel import kernel_of

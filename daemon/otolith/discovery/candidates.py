@@ -23,7 +23,7 @@ from otolith.discovery.screening import (
     inner_grid,
 )
 from otolith.estimation.problem import Component, Problem, key_of
-from otolith.twin.augmentation import sensor_site, sites, sources
+from otolith.twin.components import sensor_site, sites, sources
 
 FINE = 0.5  # spectral lines between two frequencies
 PEAKS = 3  # best grid points whose neighbourhood is searched

@@ -14,10 +14,9 @@ import numpy as np
 from otolith.acquisition.window import Array, TimeGrid
 from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
-from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.problem import Problem
-from otolith.twin.augmentation import ELAPSED
+from otolith.twin.components import ELAPSED
 from otolith.twin.definition import Input
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.units import unit_text

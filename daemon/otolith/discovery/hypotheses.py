@@ -14,8 +14,7 @@ import numpy as np
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
 from otolith.discovery.screening import DECISIVE
-from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initial_prior
-from otolith.estimation.information import QUANTILE, orthonormal_basis
+from otolith.estimation.information import QUANTILE, Evidence, Prior, extend_prior, initial_prior, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment, equation, indices, site_of
 from otolith.estimation.timing import delay_response, delayable, largest_delay

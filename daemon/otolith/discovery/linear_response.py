@@ -21,8 +21,7 @@ from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
 from otolith.estimation.window_fit import Fit
-from otolith.twin.augmentation import augmented_model, sources
-from otolith.twin.component_families import family_code
+from otolith.twin.components import augmented_model, family_code, sources
 from otolith.twin.kernel import Indices, LinearisedModel, kernel_of
 
 MAX_DIFFERENCE = 10.0  # of χ²: less than that, and a window does not distinguish a component from a parameter

@@ -12,12 +12,20 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, candidate_table
 from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse
-from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.information import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import MIN_HUMP, ComponentFamily, SourceKind, SourceRange, family_code
+from otolith.twin.components import (
+    MAX_COMPONENTS,
+    MIN_HUMP,
+    ComponentFamily,
+    SourceKind,
+    SourceRange,
+    family_code,
+    sites,
+    sources,
+)
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)

@@ -43,13 +43,13 @@ from otolith.discovery.screening import (
     linearised,
     screen_fit,
 )
-from otolith.estimation.arrival_cost import Prior, extend_prior, forget_parameter, initial_prior
+from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
-from otolith.twin.augmentation import MAX_COMPONENTS
+from otolith.twin.components import MAX_COMPONENTS
 from otolith.twin.definition import Parameter
 
 ROUNDS, STEPS_OF_ROUND = 5, 5  # of Gauss-Newton for a hypothesis

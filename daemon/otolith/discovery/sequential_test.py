@@ -34,8 +34,7 @@ from otolith.discovery.hypotheses import (
 from otolith.discovery.noise_hypothesis import is_white, normalisation
 from otolith.discovery.screening import DECISIVE, ScreeningResult
 from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
-from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem

@@ -1,6 +1,6 @@
 """The filter across windows: an interacting multiple model filter for values and trends of the parameters.
 
-The prediction of the filter is the prior of the next window (see :mod:`otolith.estimation.arrival_cost`). How fast a
+The prediction of the filter is the prior of the next window (see :mod:`otolith.estimation.information`). How fast a
 parameter may change is not known beforehand. So a bank of modes runs side by side, each with its own process noise of
 every trend, weighted by how well it predicted the windows (H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic
 Control 33, 1988). The bank is centred on its most probable mode. In each neighbour the trend noise of one parameter is
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
-from otolith.estimation.arrival_cost import Evidence
+from otolith.estimation.information import Evidence
 
 TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
 HIGHEST_LEVEL = len(TREND_NOISE) - 1

@@ -16,7 +16,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.problem import Problem
-from otolith.twin.augmentation import ELAPSED, shift_setting
+from otolith.twin.components import ELAPSED, shift_setting
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, NoiseModel, kernel_of
 

@@ -12,9 +12,8 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.estimation import imm_filter
-from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior, Innovation
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Evidence, Prior, initial_prior
 from otolith.estimation.objective import converter_steps
 from otolith.estimation.problem import INNER_BOUND, Problem, indices, source_of, without
 

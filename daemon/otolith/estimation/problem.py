@@ -10,18 +10,20 @@ import numpy as np
 
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array
-from otolith.twin.augmentation import (
+from otolith.twin.components import (
     MAX_COMPONENTS,
+    ComponentFamily,
     ComponentSource,
     augmented_model,
     component_parameters,
+    family_code,
+    family_of,
     family_setting,
     site_setting,
     sites,
     source_setting,
     sources,
 )
-from otolith.twin.component_families import ComponentFamily, family_code, family_of
 from otolith.twin.definition import Definition, Parameter, Site
 
 UNLIMITED = 1e30  # bound of an amplitude that nothing limits; any finite number would do

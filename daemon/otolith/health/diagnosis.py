@@ -6,38 +6,18 @@ most keys, which rest on most evidence. If several remain, the data do not disti
 and none is preferred.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 from pydantic import Field
 
-from otolith.health.language import Texts, texts_in
+from otolith.health.limits import MonitoredQuantity
+from otolith.health.schema import FindingKind, Language
+from otolith.health.text import Texts, texts_in
 from otolith_drivers.config_files import Range, StrictModel
 
 KEYS = ("twin", "subject", "side", "manner", "family", "input")
-
-
-class FindingKind(StrEnum):
-    """What was observed."""
-
-    LIMIT = "limit"  # A parameter is beyond a limit
-    LIMIT_FROM_START = "limit from the start"  # The same, since the first window that determined it
-    TREND = "trend"  # A parameter within its limits is on its way to one
-    LOST = "identifiability lost"  # A parameter that was determined is not any more, although the machine moves
-    COMPONENT = "component"
-    SENSOR = "sensor"
-    TIMING = "late signal"
-    NOISE = "noise"
-    CLASS = "class"  # Several hypotheses explain the windows equally well
-    OPEN = "open"  # Hypotheses are being compared
-    MOVED = "moved"  # A parameter that the machine file gives as known is another
-    RETURNS = "returns"  # Something changes again and again, and is never there for long
-    UNEXPLAINED = "unexplained"
-    NO_DATA = "no data"
-    NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
-    NO_SOURCE = "no source"  # One of several sources is down or gave no sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +87,31 @@ class RulesFile(StrictModel):
     """The file of rules."""
 
     rule: tuple[Rule, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MonitoringPlan:
+    """What is monitored of a machine, and the rules of the diagnosis. Plain: it pickles."""
+
+    parameters: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the estimated parameters
+    sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the amplitude of a component there
+    rules: Sequence[Rule] = ()
+    stated: Mapping[str, MonitoredQuantity] | None = None  # As the machine file states them, if there is a baseline
+    language: Language = "en"  # Of the texts for people
+    known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
+    """Of the parameters that are not estimated, against the values of the machine file."""
+    signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings
+
+    @property
+    def texts(self) -> Texts:
+        """The texts in the language of the machine."""
+        return texts_in(self.language)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts of the twin, in the order of its parameters and sites."""
+        quantities = (*self.parameters.values(), *self.sites.values())
+        return tuple(dict.fromkeys(quantity.part for quantity in quantities))
 
 
 def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:

@@ -11,8 +11,8 @@ from typing import Any
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import FindingKind, diagnose
-from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan, diagnose
+from otolith.health.limits import MACHINE, Level, MonitoredQuantity
 from otolith.health.observations import (
     BUS,
     PERSISTENT_WINDOWS,
@@ -30,6 +30,7 @@ from otolith.health.schema import (
     EventChange,
     EventDocument,
     EvidenceDocument,
+    FindingKind,
     ForecastDocument,
     HealthDocument,
     PartDocument,

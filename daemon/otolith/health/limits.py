@@ -6,13 +6,11 @@ wanders around its limit therefore changes nothing.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import Rule
-from otolith.health.language import Language, Texts, texts_in
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
 MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
@@ -105,28 +103,3 @@ def probability_beyond(limit: Limit, value: float, sd: float) -> float:
     if sd <= 0.0:
         return float(limit.excess(value) > 0.0)
     return 0.5 * math.erfc(-limit.excess(value) / (math.sqrt(2.0) * sd))
-
-
-@dataclass(frozen=True, slots=True)
-class MonitoringPlan:
-    """What is monitored of a machine, and the rules of the diagnosis. Plain: it pickles."""
-
-    parameters: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the estimated parameters
-    sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the amplitude of a component there
-    rules: Sequence[Rule] = ()
-    stated: Mapping[str, MonitoredQuantity] | None = None  # As the machine file states them, if there is a baseline
-    language: Language = "en"  # Of the texts for people
-    known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
-    """Of the parameters that are not estimated, against the values of the machine file."""
-    signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings
-
-    @property
-    def texts(self) -> Texts:
-        """The texts in the language of the machine."""
-        return texts_in(self.language)
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parts of the twin, in the order of its parameters and sites."""
-        quantities = (*self.parameters.values(), *self.sites.values())
-        return tuple(dict.fromkeys(quantity.part for quantity in quantities))

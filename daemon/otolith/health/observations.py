@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 from otolith.discovery.decision import Approval, WindowDecision
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
-from otolith.health.language import Texts
-from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
+from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, severity
+from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, probability_beyond
 from otolith.health.schema import (
     ComponentDocument,
     ComponentStatus,
     FindingDocument,
+    FindingKind,
     ParameterDocument,
     ReportDocument,
     Status,
 )
-from otolith.health.text import duration_text, forecast_text, interval_text, number_text, value_text
+from otolith.health.text import Texts, duration_text, forecast_text, interval_text, number_text, value_text
 from otolith_drivers.units import equation_text, unit_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level

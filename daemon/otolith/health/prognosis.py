@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.health.limits import MonitoredQuantity, MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.limits import MonitoredQuantity
 from otolith.health.schema import CrossingDocument, ForecastDocument
 
 # Thresholds: docs/reference/thresholds-health.md has the origin of each.

@@ -5,7 +5,7 @@ Every number is finite or absent. What has no content yet is absent.
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field
 
@@ -13,10 +13,32 @@ from otolith.acquisition.window import Array, Verdict, Window
 from otolith.discovery.decision import Approval, WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
-from otolith.health.diagnosis import FindingKind
-from otolith.health.language import Language
 from otolith.health.limits import Level
 from otolith_drivers.config_files import StrictModel
+
+Language = Literal["en", "de"]
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+
+
+class FindingKind(StrEnum):
+    """What was observed."""
+
+    LIMIT = "limit"  # A parameter is beyond a limit
+    LIMIT_FROM_START = "limit from the start"  # The same, since the first window that determined it
+    TREND = "trend"  # A parameter within its limits is on its way to one
+    LOST = "identifiability lost"  # A parameter that was determined is not any more, although the machine moves
+    COMPONENT = "component"
+    SENSOR = "sensor"
+    TIMING = "late signal"
+    NOISE = "noise"
+    CLASS = "class"  # Several hypotheses explain the windows equally well
+    OPEN = "open"  # Hypotheses are being compared
+    MOVED = "moved"  # A parameter that the machine file gives as known is another
+    RETURNS = "returns"  # Something changes again and again, and is never there for long
+    UNEXPLAINED = "unexplained"
+    NO_DATA = "no data"
+    NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
+    NO_SOURCE = "no source"  # One of several sources is down or gave no sample
 
 
 class ComponentStatus(StrEnum):

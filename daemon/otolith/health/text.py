@@ -1,19 +1,29 @@
-"""A report in words. Every text that shows a value, a component or a finding to a person is made here."""
+"""A report in words. Every text that shows a value, a component or a finding to a person is made here.
+
+Texts are in the language of a machine, from ``texts/en.toml`` and the like. Rules and texts have a key. What the core,
+the twins and the drivers compose in English is translated by ``[phrases]``: a phrase is an English sentence with names
+in braces, and a sentence that it matches becomes its translation, with the parts translated too. What no phrase matches
+stays English.
+"""
 
 import math
 import re
+import tomllib
 from collections.abc import Callable
+from dataclasses import dataclass
 from decimal import Decimal
+from functools import lru_cache
+from importlib.resources import files
 
 from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
-from otolith.health.language import Language, texts_in
 from otolith.health.schema import (
     ComponentDocument,
     CrossingDocument,
     EventDocument,
     FindingDocument,
     HealthDocument,
+    Language,
     ParameterDocument,
     PartDocument,
     ReportDocument,
@@ -25,8 +35,57 @@ UNKNOWN = "unknown"
 UNKNOWN_STATE = "UNKNOWN"
 PLAIN_NUMBERS = 1e-3, 1e5  # between which a number is read without a power of ten; engineering choice
 MAX_ZEROS = 6  # of decimals that an interval has beside its value; engineering choice
+ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
+PARTS = "; "
+MAX_SENTENCE = 500  # characters: the time of a match grows with a high power of them, and a device may write the text
 UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 """Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
+
+
+@dataclass(frozen=True, slots=True)
+class Texts:
+    """The texts of a language."""
+
+    language: Language
+    rules: dict[str, dict[str, str]]  # Condition, cause and advice of each rule, by its id
+    texts: dict[str, str]  # By key, with names in braces
+    phrases: dict[str, str]  # Translations by the English phrase; empty for English
+    patterns: tuple[tuple[re.Pattern[str], str], ...]  # The phrases with names in braces; the first that matches counts
+
+    def __call__(self, key: str, **values: object) -> str:
+        """Return the text of ``key`` with its values."""
+        return self.texts[key].format(**values)
+
+    def translated(self, text: str) -> str:
+        """Return an English text in this language; what no phrase matches stays English."""
+        if not self.phrases or not text:
+            return text
+        if (whole := self.phrases.get(text)) is not None:
+            return whole
+        for joint, own in ((ALTERNATIVES, self.texts["alternatives"]), (PARTS, PARTS)):
+            if joint in text:
+                return own.join(map(self.translated, text.split(joint)))
+        if len(text) > MAX_SENTENCE:
+            return text
+        for pattern, translation in self.patterns:
+            if match := pattern.fullmatch(text):
+                return translation.format(**{name: self.translated(part) for name, part in match.groupdict().items()})
+        return text
+
+
+@lru_cache
+def texts_in(language: Language) -> Texts:
+    """Return the texts of a language."""
+    content = tomllib.loads(files("otolith.health").joinpath("texts", f"{language}.toml").read_text(encoding="utf-8"))
+    phrases: dict[str, str] = content.get("phrases", {})
+    patterns = tuple((_pattern(phrase), text) for phrase, text in phrases.items() if "{" in phrase)
+    return Texts(language, content["rules"], content["texts"], phrases, patterns)
+
+
+def _pattern(phrase: str) -> re.Pattern[str]:
+    """Return the expression of a phrase: each name in braces is any text, and ``share`` is a number."""
+    expression = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.*?)", re.escape(phrase)).replace("<share>.*?", r"<share>[<>]?[\d.]+")
+    return re.compile(expression, re.DOTALL)
 
 
 def number_text(value: float, digits: int = 5) -> str:

@@ -19,9 +19,9 @@ from markupsafe import Markup
 
 from otolith import __version__
 from otolith.health import text
-from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.text import Texts, texts_in
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
 from otolith_drivers.units import equation_text, formula_text
 

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from rerun.blueprint.encodings import TimelineColumn
 
 from otolith.acquisition.window import Array, Verdict
-from otolith.health.language import Texts, texts_in
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, Report, ReportDocument, Status
 from otolith.health.text import (
+    Texts,
     announcements,
     event_text,
     forecast_text,
@@ -34,6 +34,7 @@ from otolith.health.text import (
     number_text,
     probability_text,
     state_word,
+    texts_in,
     value_text,
 )
 from otolith.machine import RecordedMachine

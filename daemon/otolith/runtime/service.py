@@ -26,15 +26,14 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_problem, with_sample_grid
-from otolith.health.limits import MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
-from otolith.runtime.process import SIGNALS, EventCommand
-from otolith.runtime.recorder_supervisor import RecorderSupervisor
+from otolith.runtime.process import SIGNALS, EventCommand, RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine

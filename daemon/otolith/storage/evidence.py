@@ -41,7 +41,7 @@ from otolith.health.text import announcements
 from otolith.machine import FINGERPRINT_KEYS, LIBRARY, LoadedMachine
 from otolith.storage.disk import WRITE_RETRY, WriterThread, reason_of, replace_file
 from otolith.storage.recording_files import STAMP
-from otolith.twin.augmentation import augmented_model
+from otolith.twin.components import augmented_model
 from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read

@@ -15,7 +15,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from otolith.health.limits import Level, MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, ReportDocument
 from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError

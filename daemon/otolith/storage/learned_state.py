@@ -15,7 +15,6 @@ from pydantic import BaseModel, Field
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
-from otolith.estimation.arrival_cost import MAX_TREND
 from otolith.estimation.imm_filter import (
     HIGHEST_LEVEL,
     MAX_VARIANCE_RATIO,
@@ -23,13 +22,13 @@ from otolith.estimation.imm_filter import (
     ParameterCusum,
     moment_match,
 )
+from otolith.estimation.information import MAX_TREND
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem, augment, indices
 from otolith.health.events import HealthState
 from otolith.health.prognosis import is_plausible
 from otolith.health.status import PreviousStatus
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES, MAX_COMPONENTS, sites, sources
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 

@@ -15,7 +15,7 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
-from otolith.twin.augmentation import augmentation_inputs
+from otolith.twin.components import augmentation_inputs
 from otolith.twin.definition import Definition
 from otolith.twin.symbolic import COMPONENT_SLOPES, component, system_of
 

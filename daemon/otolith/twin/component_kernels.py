@@ -8,7 +8,7 @@ and ``spread`` score a whole spectrum of curves at the cost of a few. All but ``
 import sympy
 
 from otolith.twin.codegen import INNER, PRINTER, STAGES, Blocks, KernelCode, unpacked
-from otolith.twin.component_families import COMPONENT_FAMILIES, family_code
+from otolith.twin.components import COMPONENT_FAMILIES, family_code
 from otolith.twin.symbolic import absolute, sign
 
 # Columns of dx, the derivative of the next state: this state, the sites' inputs at this record, then at the next one.

@@ -110,7 +110,7 @@ class Definition:
     constants: tuple[Constant, ...] = ()
     definitions: tuple[tuple[str, str, str], ...] = ()  # Name, expression and meaning, in the author's order
     sites: tuple[Site, ...] = ()
-    base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.augmentation)
+    base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.components)
 
     def __hash__(self) -> int:
         """Of the name alone, as what is prepared once for a twin is looked up several times in each window."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import sympy
 
-from otolith.twin.augmentation import (
+from otolith.twin.components import (
     MAX_COMPONENTS,
     augmentation_inputs,
     component_parameters,

@@ -1,4 +1,7 @@
-"""A read-only Modbus client over pymodbus: only function codes 1 to 4, which read bits and registers."""
+"""A read-only Modbus client over pymodbus: only function codes 1 to 4, which read bits and registers.
+
+How a request can fail is here as well: an exception of the device, no reply, or a lost connection.
+"""
 
 import contextlib
 import errno
@@ -20,7 +23,24 @@ from pymodbus.framer import FramerType
 
 from otolith_drivers.common.reconnection import cause_of
 from otolith_drivers.modbus.options import BIT_TABLES, LineOptions, Table
-from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
+
+# Modbus Application Protocol V1.1b3, section 7.
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "server device failure",
+    5: "acknowledge, it takes longer",
+    6: "server device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target device failed to respond",
+}
+ILLEGAL_FUNCTION = 1  # Exception of a device that does not serve the function, such as reading a table that it lacks
+ILLEGAL_ADDRESS = 2  # Exception for registers that the device does not have
+PERMANENT_CODES = (ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, 3)  # Exceptions that a repeated request will meet again
+BUSY_CODES = (5, 6)  # Exceptions that ask to repeat the request later
+GATEWAY_CODES = (10, 11)  # Exceptions by which a gateway reports that the device does not answer
 
 FUNCTION_CODES: Final[dict[Table, int]] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 DRAIN_STEP = 0.02  # s between looks for late bytes; engineering choice: at most 1 % of a core
@@ -28,6 +48,27 @@ HEADER_LENGTH = 7  # bytes of a TCP answer before its function code
 READS: Final = {1: "read_coils", 2: "read_discrete_inputs", 3: "read_holding_registers", 4: "read_input_registers"}
 REPEATED_FIELDS = (("reply_transaction", "transaction", 0, 2), ("reply_device", "device", 6, 7))
 MAX_DRAIN = 5  # timeouts, after which a line that never falls silent is reopened all the same; engineering choice
+
+
+class ExceptionReplyError(Exception):
+    """The device answers with an exception: it does not have the registers, returns fewer at once, or is busy."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
+        self.code = code
+
+    @property
+    def meaning(self) -> str:
+        """The exception's name in the standard."""
+        return EXCEPTIONS.get(self.code, str(self))
+
+
+class NoReplyError(Exception):
+    """No valid answer arrives in time, as from a device that is off or late; the connection itself stands."""
+
+
+class ConnectionLostError(Exception):
+    """The connection fails: it is refused or closed, the host unreachable, or the serial adapter unplugged."""
 
 
 class ReadOnlyClient:

@@ -12,10 +12,15 @@ from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
-from otolith_drivers.modbus.client import ReadOnlyClient
+from otolith_drivers.modbus.client import (
+    BUSY_CODES,
+    ConnectionLostError,
+    ExceptionReplyError,
+    NoReplyError,
+    ReadOnlyClient,
+)
 from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
-from otolith_drivers.modbus.protocol import BUSY_CODES, ConnectionLostError, ExceptionReplyError, NoReplyError
 from otolith_drivers.modbus.schedule import MAX_FAILURES, PollSchedule, Request, RequestSet, plan, summary
 
 __all__ = ["ModbusPoller", "Options", "Source", "build"]

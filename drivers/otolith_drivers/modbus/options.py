@@ -1,16 +1,22 @@
-"""The Modbus tables of a machine file: the line, the devices on it, and the registers of each signal."""
+"""The Modbus tables of a machine file: the line, the devices on it, and the registers of each signal.
+
+A register has 16 bits, high byte first on the wire (Modbus Application Protocol V1.1b3, section 4.2). The standard
+does not define the order of the registers of a longer number, so all orders occur. They are named by the positions of
+the bytes A (highest) to D (lowest) of a 32-bit number; 64-bit numbers follow the same rule.
+"""
 
 import math
+import re
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Conversion, ScaledSource, Signal
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.modbus.protocol import Order, TypeName, bit_reader, reader, registers_of
 from otolith_drivers.units import Quantity
 
 MAX_REGISTERS = 125  # of one request (Modbus Application Protocol V1.1b3, sections 6.3 and 6.4)
@@ -20,9 +26,64 @@ SILENT_CHARACTERS = 3.5  # between frames (Modbus over Serial Line V1.02, sectio
 
 MAX_DECIMALS = 9  # digits behind the point; more are no decimals register
 
+TypeName = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
+Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
+ORDERS: tuple[Order, ...] = get_args(Order)
+WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})  # Orders with the lowest register first
+BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})  # Orders with the low byte of each register first
+LETTERS: dict[TypeName, str] = dict(zip(get_args(TypeName), "hHiIqQfd", strict=True))  # Of struct, by type
+BITS = re.compile(r"(\d{1,2})(?:\.\.(\d{1,2}))?")
+
 Table = Literal["holding", "input", "coil", "discrete"]
 BIT_TABLES: dict[Table, str] = {"coil": "coil", "discrete": "discrete input"}  # Tables of bits, and their names
 Device = Annotated[int, Field(ge=0, le=255)]
+
+
+def registers_of(kind: TypeName) -> int:
+    """Return the number of registers of a number."""
+    return struct.calcsize(f">{LETTERS[kind]}") // 2
+
+
+def is_float(kind: TypeName) -> bool:
+    """Whether the type is a float."""
+    return kind.startswith("float")
+
+
+def orders_of(kind: TypeName) -> tuple[Order, ...]:
+    """Return the orders that differ for this type: a single register has no word order."""
+    return ORDERS if registers_of(kind) > 1 else ("ABCD", "BADC")
+
+
+def reader(kind: TypeName, order: Order) -> Callable[[Sequence[int]], float]:
+    """Return a function from a number's registers (each 0 to 65535, in the order of addresses) to the number."""
+    words = struct.Struct(f"{'<' if order in BYTES_SWAPPED else '>'}{registers_of(kind)}H")
+    number = struct.Struct(f">{LETTERS[kind]}")
+    backwards = order in WORDS_SWAPPED
+
+    def read(registers: Sequence[int]) -> float:
+        value: float = number.unpack(words.pack(*(registers[::-1] if backwards else registers)))[0]
+        return value
+
+    return read
+
+
+def bit_reader(written: str, kind: TypeName) -> Callable[[float], int]:
+    """Return a function from an integer to its bits ``"3"`` or ``"4..7"``; bit 0 is the lowest.
+
+    Raises:
+        ValueError: malformed, not ascending, a field of a float, or beyond the bits of the type.
+    """
+    match = BITS.fullmatch(written.strip())
+    if match is None:
+        raise ValueError(f'bits {written!r}: write one bit like "3", or the lowest and highest like "4..7"')
+    low, high = int(match[1]), int(match[2] or match[1])
+    width = 16 * registers_of(kind)
+    if is_float(kind):
+        raise ValueError(f"bits {written!r}: a {kind} has no bit fields")
+    if not low <= high < width:
+        raise ValueError(f"bits {written!r}: {kind} has bits 0 to {width - 1}; write the lower one first")
+    mask = (1 << (high - low + 1)) - 1
+    return lambda value: int(value) >> low & mask
 
 
 class LineOptions(StrictModel):

@@ -19,8 +19,7 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith_drivers.modbus.options import RegisterSignal
-from otolith_drivers.modbus.protocol import Order, TypeName, is_float, orders_of, reader, registers_of
+from otolith_drivers.modbus.options import Order, RegisterSignal, TypeName, is_float, orders_of, reader, registers_of
 from otolith_drivers.modbus.schedule import Request
 
 # Byte order. Engineering choices, guarded as a set by tests/drivers/modbus/test_plausibility.py: all swapped orders

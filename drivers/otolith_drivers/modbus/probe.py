@@ -18,16 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.modbus.client import ReadOnlyClient
-from otolith_drivers.modbus.options import MAX_REGISTERS, LineOptions, Table
-from otolith_drivers.modbus.protocol import (
+from otolith_drivers.modbus.client import (
     BUSY_CODES,
     GATEWAY_CODES,
     ConnectionLostError,
     ExceptionReplyError,
     NoReplyError,
-    TypeName,
+    ReadOnlyClient,
 )
+from otolith_drivers.modbus.options import MAX_REGISTERS, LineOptions, Table, TypeName
 from otolith_drivers.number_inference import (
     REGISTERS,
     Bytes,

@@ -10,8 +10,7 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from otolith_drivers.modbus.options import BIT_TABLES, RegisterSignal, Table
-from otolith_drivers.modbus.protocol import (
+from otolith_drivers.modbus.client import (
     BUSY_CODES,
     GATEWAY_CODES,
     ILLEGAL_ADDRESS,
@@ -19,6 +18,7 @@ from otolith_drivers.modbus.protocol import (
     PERMANENT_CODES,
     ExceptionReplyError,
 )
+from otolith_drivers.modbus.options import BIT_TABLES, RegisterSignal, Table
 
 # Requests. Engineering choices, guarded by tests/drivers/modbus/test_schedule.py.
 MAX_FAILURES = 3  # in a row before a request or device is paused; one timeout on a noisy line is no dead device

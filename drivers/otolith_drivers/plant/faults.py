@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.modbus.protocol import Order
+from otolith_drivers.modbus.options import Order
 from otolith_drivers.units import Quantity
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.config_files import StrictModel, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.modbus.protocol import BYTES_SWAPPED, LETTERS, WORDS_SWAPPED, Order
+from otolith_drivers.modbus.options import BYTES_SWAPPED, LETTERS, WORDS_SWAPPED, Order
 from otolith_drivers.plant.faults import (
     Array,
     Distortion,

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus.client import ReadOnlyClient
+from otolith_drivers.modbus.client import ConnectionLostError, ExceptionReplyError, NoReplyError, ReadOnlyClient
 from otolith_drivers.modbus.driver import Options
-from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import TIMEOUT, TWO, Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from otolith_drivers.modbus.options import ORDERS, Order, TypeName, orders_of, registers_of
 from otolith_drivers.modbus.plausibility import MAX_STALE_RUN, OrderMonitor, StalenessMonitor, judge_order
-from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, orders_of, registers_of
 from otolith_drivers.modbus.schedule import plan
 from tests.drivers.registers import KINDS, item, registers
 

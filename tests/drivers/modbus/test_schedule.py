@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
-from otolith_drivers.modbus.protocol import ExceptionReplyError, TypeName
+from otolith_drivers.modbus.client import ExceptionReplyError
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, TypeName, register_signal
 from otolith_drivers.modbus.schedule import (
     DECISION_ROUNDS,
     FAST_DECISIONS,

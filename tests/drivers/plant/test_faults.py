@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.modbus.protocol import Order
+from otolith_drivers.modbus.options import Order
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import (
     BusEffect,

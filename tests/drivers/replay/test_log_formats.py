@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay import frame_readers
+from otolith_drivers.replay import can_log
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
 from otolith_drivers.replay.tables import TableReader
 from tests.drivers import logs
@@ -288,7 +288,7 @@ def test_an_mf4_file_of_signals_names_them_and_a_damaged_one_is_no_traceback(tmp
 
 def test_a_missing_library_for_mf4_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bus.mf4").write_bytes(b"MDF     4.10")
-    monkeypatch.setattr(frame_readers, "find_spec", lambda _: None)
+    monkeypatch.setattr(can_log, "find_spec", lambda _: None)
     with pytest.raises(ConfigurationError, match=re.escape("pip install 'otolith[mf4]'")):
         read(tmp_path / "bus.mf4")
 

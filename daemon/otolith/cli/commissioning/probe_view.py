@@ -17,8 +17,8 @@ from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.errors import counted, some_names
 from otolith_drivers.modbus import probe as modbus
-from otolith_drivers.modbus.client import FUNCTION_CODES
-from otolith_drivers.modbus.protocol import BUSY_CODES, EXCEPTIONS, LETTERS, TypeName
+from otolith_drivers.modbus.client import BUSY_CODES, EXCEPTIONS, FUNCTION_CODES
+from otolith_drivers.modbus.options import LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
 
 PLAIN_WIDTH = 200  # columns of output that goes into a file

@@ -19,17 +19,17 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import drain, local_time
-from otolith.health.diagnosis import FindingKind
-from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
-from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
 from otolith.health.text import (
+    Texts,
     duration_text,
     forecast_text,
     headline,
     interval_text,
     probability_text,
     state_word,
+    texts_in,
     value_cells,
     value_text,
 )

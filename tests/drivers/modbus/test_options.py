@@ -7,8 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, register_signal
-from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, bit_reader, reader, registers_of
+from otolith_drivers.modbus.options import (
+    ORDERS,
+    ModbusOptions,
+    ModbusSource,
+    Order,
+    TypeName,
+    bit_reader,
+    reader,
+    register_signal,
+    registers_of,
+)
 from tests.drivers.registers import KINDS, item, registers
 
 
