@@ -311,7 +311,8 @@ def chi_square_of_parameters(fitted: Fit) -> float:
     size = np.linalg.norm(jacobian, axis=0)
     alive = size > 0.0
     columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
-    return float(np.linalg.qr(columns, mode="r")[-1, -1] ** 2)
+    triangle: Array = np.asarray(np.linalg.qr(columns, mode="r"))
+    return float(triangle[-1, -1] ** 2)
 
 
 def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:

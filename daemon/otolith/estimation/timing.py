@@ -55,7 +55,8 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
     grid = _grid(times, end, tolerance)
     late = [delays.get(signal, 0.0) for signal in window.signals]
     last = {delay: _last_samples(window.grid.offsets - delay, times, tolerance) for delay in set(late)}
-    before, is_between = (np.column_stack([last[delay][part] for delay in late]) for part in (0, 1))
+    before = np.column_stack([last[delay][0] for delay in late])
+    is_between = np.column_stack([last[delay][1] for delay in late])
     rows = before, np.arange(len(late))
     values, missing = window.values[rows], is_between | window.missing[rows]
     for driven in twin.inputs:

@@ -87,10 +87,16 @@ class Excitation:
         return Excitation(self.inputs[part], grid, substeps, measured, gain)
 
 
-def _ordinary_step(grid: TimeGrid) -> float:
-    """The median step (s), but no small share of the mean one: samples may come in pairs."""
+def _stretch(grid: TimeGrid) -> int:
+    """How many times longer the longest step is than an ordinary one, as the next power of two.
+
+    An ordinary one is the median, but no small share of the mean one: samples may come in pairs.
+    """
+    if grid.period is not None or grid.records < 2:
+        return 1
     steps = grid.steps[:-1]
-    return max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
+    ordinary = max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
+    return 2 ** int(np.ceil(np.log2(_longest(grid) / ordinary) - WHOLE))
 
 
 def _longest(grid: TimeGrid) -> float:
@@ -299,11 +305,9 @@ class Kernel:
         an ordinary step: the longest may have as many more as it is longer, so that the cost is linear in the records.
         """
         grid, count = excitation.grid, excitation.substeps
-        if grid.period is None and grid.records > 1:
-            limit *= 2 ** int(np.ceil(np.log2(_longest(grid) / _ordinary_step(grid)) - WHOLE))
         first, second = parameters[None], initial[None]
         coarse = self.simulate(first, second, excitation)
-        while count < limit:
+        while count < limit or count < limit * _stretch(grid):
             inputs, steps, counts, *correction = excitation.arguments
             fine = self._call("simulate", first, second, inputs, steps, 2 * counts, *correction)
             with np.errstate(invalid="ignore"):
