@@ -297,15 +297,13 @@ def _time_offsets(problem: Problem, window: Window) -> dict[str, float]:
 
 def input_matrix(twin: Definition, window: Window) -> Array:
     """Return the inputs (records, inputs) of a twin with or without slots."""
-    columns = [np.zeros((window.records, 0))]
-    for source in twin.inputs:
+    inputs = np.zeros((window.records, len(twin.inputs)))
+    for column, source in enumerate(twin.inputs):
         if source.name == ELAPSED:
-            columns.append(window.grid.offsets[:, None])
-        elif source.name.startswith("_"):
-            columns.append(np.zeros((window.records, 1)))
-        else:
-            columns.append(window.column(source.name)[:, None])
-    return np.hstack(columns)
+            inputs[:, column] = window.grid.offsets
+        elif not source.name.startswith("_"):
+            inputs[:, column] = window.column(source.name)
+    return inputs
 
 
 def rounding_variance(values: Array, noise: float, known_step: float) -> float:
@@ -391,7 +389,7 @@ def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Arra
         if index is not None and present[:, index].any():
             values = measured[present[:, index], index]
             first = float(values[0])
-            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(values)))
+            reach = max(INITIAL_STATE_REACH * noise[index], float(values.max() - values.min()))
             low, high = first - reach, first + reach
             if not present[0, index]:  # the state may have moved before its first measurement
                 low, high = min(low, state.low), max(high, state.high)
