@@ -96,7 +96,7 @@ def _stretch(grid: TimeGrid) -> int:
         return 1
     steps = grid.steps[:-1]
     ordinary = max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
-    return 2 ** int(np.ceil(np.log2(_longest(grid) / ordinary) - WHOLE))
+    return 1 << int(np.ceil(np.log2(_longest(grid) / ordinary) - WHOLE))
 
 
 def _longest(grid: TimeGrid) -> float:
