@@ -301,8 +301,7 @@ class LinearResponse(ProjectedResponse):
         parameters = objective.parameters(self._guess[None])[0]
         wanted, initial = [order.index(name) for name in names], self._guess[objective.free :]
         slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
-        columns = np.where(objective.present[..., None], slopes, 0.0)
-        return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
+        return -objective.kernel.whiten(objective.innovation_model, slopes, objective.present)
 
 
 def chi_square_of_parameters(fitted: Fit) -> float:

@@ -53,7 +53,6 @@ class Objective:
         self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
-        self.is_complete = bool(self.present.all())  # Whether every output was measured in every record
         self._seed = problem.seed + window.index
         levels = zip((twin.base or twin).inputs, problem.input_noise, strict=False)
         self._noisy_inputs = [
@@ -196,10 +195,7 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
-            slopes = prediction.slopes
-            if not self.is_complete:
-                slopes = np.where(self.present[..., None], slopes, 0.0)
-            jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
+        jacobian = self.kernel.whiten(self.innovation_model, prediction.slopes, self.present)
         if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)

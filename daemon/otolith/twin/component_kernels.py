@@ -232,6 +232,23 @@ def spread(x, signals, first, width, points, variance, reach):
     return grid
 '''
 
+WHITEN = '''
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def whiten(whitening, slopes, present):
+    """(records, outputs, outputs), (records, outputs, columns) -> (records * outputs, columns): of the innovations."""
+    records, outputs, columns = slopes.shape
+    whitened = np.zeros((records * outputs, columns))
+    for record in range(records):
+        for row in range(outputs):
+            target = whitened[record * outputs + row]
+            for output in range(row + 1):
+                if present[record, output]:
+                    factor = whitening[record, row, output]
+                    for column in range(columns):
+                        target[column] += factor * slopes[record, output, column]
+    return -whitened
+'''
+
 CURVES = '''
 @njit(cache=True, error_model="numpy")
 def curves(family, x, sources, b, c):
@@ -258,9 +275,9 @@ def component_functions() -> list[str]:
 
 
 def kernels_of_all_twins() -> list[str]:
-    """``curves``, ``respond``, ``adjoint`` and ``spread``, with what they call."""
+    """``whiten``, ``curves``, ``respond``, ``adjoint`` and ``spread``, with what they call."""
     lines = component_functions()
-    for kernel in (CURVES, RESPOND, ADJOINT, SPREAD):
+    for kernel in (WHITEN, CURVES, RESPOND, ADJOINT, SPREAD):
         lines += [*kernel.strip().splitlines(), "", ""]
     return lines
 

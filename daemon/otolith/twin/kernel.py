@@ -33,7 +33,7 @@ many as with equal steps."""
 RELATIVE_TOLERANCE = 1e-11
 """Of the largest value of an output: truncation error that is allowed in any case, as rounding errors are near it."""
 
-SHARED = frozenset({"curves", "respond", "adjoint", "spread"})
+SHARED = frozenset({"whiten", "curves", "respond", "adjoint", "spread"})
 """Kernels that are the same for all twins: compiled once for all of them."""
 
 Indices = NDArray[np.int64]
@@ -198,6 +198,11 @@ class Kernel:
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
         drive = (*excitation.arguments, excitation.grid.before_last, np.array(columns, dtype=np.int64))
         return Sensitivities(*self._call("sensitivities", parameters, initial, *drive))
+
+    def whiten(self, innovation: InnovationModel, slopes: Array, present: Mask) -> Array:
+        """(records * outputs, columns): the derivatives of the whitened innovations, from those of the prediction."""
+        derivatives: Array = self._call("whiten", innovation.whitening, slopes, present)
+        return derivatives
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
