@@ -87,7 +87,7 @@ class Excitation:
         return Excitation(self.inputs[part], grid, substeps, measured, gain)
 
 
-def _stretch(grid: TimeGrid) -> int:
+def _step_ratio(grid: TimeGrid) -> int:
     """How many times longer the longest step is than an ordinary one, as the next power of two.
 
     An ordinary one is the median, but no small share of the mean one: samples may come in pairs.
@@ -312,7 +312,7 @@ class Kernel:
         grid, count = excitation.grid, excitation.substeps
         first, second = parameters[None], initial[None]
         coarse = self.simulate(first, second, excitation)
-        while count < limit or count < limit * _stretch(grid):
+        while count < limit or count < limit * _step_ratio(grid):
             inputs, steps, counts, *correction = excitation.arguments
             fine = self._call("simulate", first, second, inputs, steps, 2 * counts, *correction)
             with np.errstate(invalid="ignore"):
