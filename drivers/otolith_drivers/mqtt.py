@@ -1,6 +1,6 @@
 """The MQTT driver: subscribes to the topics of its signals, and reconnects after every fault. It never publishes.
 
-With a time field, the time of a sample is the sender's, on a clock that nobody can be asked for: the fastest message of
+With a time field, the time of a sample is the sender's, on a clock that cannot be queried: the fastest message of
 the last seconds counts as one that took no time. Without one, it is the time of arrival. The way from a message to
 samples (:class:`Messages`) has no clock and no connection.
 """

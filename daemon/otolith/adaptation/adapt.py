@@ -228,7 +228,7 @@ def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test:
 
     The window that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest are no
     evidence against its hypotheses: it is closed only when windows are decisive evidence for the filter. Until then the
-    filter is one of the hypotheses. Hypotheses that explain no window have no evidence to lose.
+    filter is one of the hypotheses. Hypotheses that explain no window have none to weigh against it.
     """
     result = _update_filter(state, tested)
     if test.filter_evidence.is_for or test.best.type is FaultType.NOTHING or not test.has_explained:

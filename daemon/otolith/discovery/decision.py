@@ -18,13 +18,13 @@ from otolith.estimation.problem import Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
-COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
+COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # windows that must agree on a component, and its probability
 TIMING_WINDOWS = 2  # windows that must agree on a late signal
 DATA_FAULT_PROBABILITY = 0.8  # of a faulty sensor or a late signal, if no other type explains the windows as well
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
-INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude: the same, however certain
+INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
 
 

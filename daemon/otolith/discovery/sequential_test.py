@@ -234,7 +234,7 @@ def continue_test(test: SequentialTest, predicted: Posterior, screening: Screeni
     """Return the test after the screened window.
 
     Where the tracked hypotheses do not explain the window, a new search adds others: something may have begun since.
-    Hypotheses of which none has explained any window are no choice: the test begins again.
+    If no hypothesis has explained any window, the test begins again.
     """
     if not test.has_explained:
         return replace(open_test(predicted, screening), onset=test.onset)

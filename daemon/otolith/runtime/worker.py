@@ -1,8 +1,8 @@
 """The worker process, which adapts to one window at a time, and its supervisor in the daemon.
 
 The worker is stateless: it receives state and window, and returns the next state and the report. The state of record
-stays with the supervisor, so the death of a worker costs no more than the current window. That window is tried once
-more; if its worker dies again, or if it takes too long, it is counted as missed.
+stays with the supervisor, so if a worker ends, at most the current window is lost. That window is tried once more; if
+its worker ends again, or if it takes too long, it is counted as missed.
 
 The daemon imports this module too, so the adaptation core with its compiler and optimiser is imported only in the
 functions that run in the worker.
