@@ -110,7 +110,7 @@ def test_a_folder_that_cannot_be_written_is_logged_once(
 ) -> None:
     """Monitoring begins and goes on without recordings; a file that somebody asked for is refused at once."""
     (tmp_path / "recordings").write_text("a file", encoding="utf-8")
-    with pytest.raises(ServiceError, match="not writable"):
+    with pytest.raises(ServiceError, match="a file, not a folder: move it away"):
         RecorderSupervisor(machine, tmp_path / "recordings" / "own.rrd").start(0.0)
     supervisor.start(0.0)
     for minute in range(100):
