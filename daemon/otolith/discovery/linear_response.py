@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.data_checks import median
-from otolith.estimation.information import orthonormal_basis
+from otolith.estimation.information import chi_square_left, orthonormal_basis
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
@@ -307,11 +307,7 @@ class LinearResponse(ProjectedResponse):
 def chi_square_of_parameters(fitted: Fit) -> float:
     """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
     _, residuals, jacobian = fitted.result.first
-    size = np.linalg.norm(jacobian, axis=0)
-    alive = size > 0.0
-    columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
-    triangle: Array = np.asarray(np.linalg.qr(columns, mode="r"))
-    return float(triangle[-1, -1] ** 2)
+    return chi_square_left(jacobian, residuals)
 
 
 def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:

@@ -89,7 +89,9 @@ def _bank(levels: tuple[int, ...]) -> Levels:
             modes.append(centre.copy())
             modes[-1][parameter] = other
     raised = [np.maximum(mode, mode.max() - MAX_LEVELS_BELOW) for mode in modes]
-    return np.array(list({tuple(mode.tolist()): None for mode in raised}))
+    bank = np.array(list({tuple(mode.tolist()): None for mode in raised}))
+    bank.flags.writeable = False  # many posteriors share it
+    return bank
 
 
 def process_model(elapsed: float) -> tuple[Array, Array]:

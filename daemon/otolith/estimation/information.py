@@ -150,6 +150,20 @@ def orthonormal_basis(jacobian: Array) -> Array:
     return np.asarray(basis[:, singular > MIN_BASIS_SINGULAR * singular.max(initial=0.0)])
 
 
+def chi_square_left(jacobian: Array, residuals: Array) -> float:
+    """Return χ² of what no change of the guess can explain: a triangular factor is faster than the basis.
+
+    If columns depend on each other, the factor would also leave out a direction that rounding chooses.
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    alive = size > 0.0
+    columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
+    diagonal = np.diag(np.linalg.qr(columns, mode="r"))
+    if len(diagonal) == columns.shape[1] and (np.abs(diagonal[:-1]) > MIN_BASIS_SINGULAR).all():
+        return float(diagonal[-1] ** 2)
+    return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
+
+
 def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
     """Return the factor on standard deviations for a residual larger than the noise.
 

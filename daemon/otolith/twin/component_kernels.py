@@ -235,7 +235,10 @@ def spread(x, signals, first, width, points, variance, reach):
 WHITEN = '''
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def whiten(whitening, slopes, present):
-    """(records, outputs, outputs), (records, outputs, columns) -> (records * outputs, columns): of the innovations."""
+    """(records, outputs, outputs), (records, outputs, columns) -> (records * outputs, columns)
+
+    Minus ``whitening @ slopes``, where ``slopes`` of values that are not present count as zero.
+    """
     records, outputs, columns = slopes.shape
     whitened = np.zeros((records * outputs, columns))
     for record in range(records):
