@@ -329,9 +329,12 @@ def _description(
 
 
 def _states(
-    plan: MonitoringPlan, before: HealthDocument | None, report: ReportDocument, events: Sequence[EventDocument],
+    plan: MonitoringPlan,
+    before: HealthDocument | None,
+    report: ReportDocument,
+    events: Sequence[EventDocument],
     determined: Collection[str],
-) -> HealthDocument:  # fmt: skip
+) -> HealthDocument:
     """Return the states of parts and machine; ``events`` begin with the most severe.
 
     ``determined`` are the parameters that once were. Without data, all parts of the machine are at NO DATA.

@@ -33,9 +33,13 @@ class MessageOrder:
     """
 
     def __init__(
-        self, query: Callable[[str, int], list[str]], on_message: Callable[[str], None],
-        pause: Callable[[], bool], after: int | None, topics: tuple[Topic, ...] = (REPORT,),
-    ) -> None:  # fmt: skip
+        self,
+        query: Callable[[str, int], list[str]],
+        on_message: Callable[[str], None],
+        pause: Callable[[], bool],
+        after: int | None,
+        topics: tuple[Topic, ...] = (REPORT,),
+    ) -> None:
         """``pause`` waits between two queries and returns whether to stop; ``after`` is where unknown keys begin."""
         self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
         self._topics = topics
@@ -110,9 +114,13 @@ class Subscriber:
     """Passes the messages of machines to ``on_message``, which may block; it runs in a thread of its own."""
 
     def __init__(
-        self, connection: Connection, on_message: Callable[[str], None], machine: str = "*",
-        topics: tuple[Topic, ...] = (REPORT,), after: int | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        connection: Connection,
+        on_message: Callable[[str], None],
+        machine: str = "*",
+        topics: tuple[Topic, ...] = (REPORT,),
+        after: int | None = None,
+    ) -> None:
         """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``.
 
         Without endpoints it reads all daemons on this computer that this user may read.

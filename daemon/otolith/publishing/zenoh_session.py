@@ -196,9 +196,13 @@ class Publisher:
     """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
 
     def __init__(
-        self, site: str, machine: str, listen: Iterable[str],
-        access: Access = Access(), archive: HistoryWriter | None = None,  # noqa: B008 - immutable
-    ) -> None:  # fmt: skip
+        self,
+        site: str,
+        machine: str,
+        listen: Iterable[str],
+        access: Access = Access(),  # noqa: B008 - immutable
+        archive: HistoryWriter | None = None,
+    ) -> None:
         """Queries for earlier reports and events are answered from ``archive``."""
         settings, self._validity = access.settings(prefix(site, machine), listen)
         self._warned_on: date | None = None

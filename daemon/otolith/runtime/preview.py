@@ -139,9 +139,13 @@ class Preview:
 
 
 def preview_recording(
-    machine: LoadedMachine, data: Path, stopped: Stopped = lambda: False, *, max_rows: int | None = None,
+    machine: LoadedMachine,
+    data: Path,
+    stopped: Stopped = lambda: False,
+    *,
+    max_rows: int | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Preview:  # fmt: skip
+) -> Preview:
     """Return the preview of ``data``: of its first ``max_rows`` rows, without a proposal and computing times, if given.
 
     The file is read once, and again for a proposed window. ``progress`` is called from time to time with a text.

@@ -142,9 +142,14 @@ class Replay:
     """One file through rings, windower and adaptation core."""
 
     def __init__(
-        self, machine: LoadedMachine, data: Reader, stopped: Stopped = lambda: False,
-        wait: Callable[[Window], None] | None = None, *, timing: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        machine: LoadedMachine,
+        data: Reader,
+        stopped: Stopped = lambda: False,
+        wait: Callable[[Window], None] | None = None,
+        *,
+        timing: bool = False,
+    ) -> None:
         """``stopped`` ends the replay early; ``wait`` is called with each window before it is adapted to.
 
         With ``timing`` the reports have computing times, so that they differ from run to run.

@@ -269,9 +269,13 @@ def _replayed(
 
 
 def _review(
-    machine: "LoadedMachine", store: "StateStore", state: "AdaptationState", pooled: "tuple[ComponentRecord, ...]",
-    *, approve_all: bool,
-) -> None:  # fmt: skip
+    machine: "LoadedMachine",
+    store: "StateStore",
+    state: "AdaptationState",
+    pooled: "tuple[ComponentRecord, ...]",
+    *,
+    approve_all: bool,
+) -> None:
     """Ask for a decision on each component, keep the approved ones, and print the estimated parameters.
 
     The values of ``pooled`` components are kept: all windows together are more precise than the filter after them.

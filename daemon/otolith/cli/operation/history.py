@@ -57,9 +57,15 @@ def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
 @AS_JSON
 @click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
 def history(
-    machine: str, since: float, names: tuple[str, ...], every: str | None,
-    only_events: bool, as_csv: bool, as_json: bool, parquet: Path | None,
-) -> None:  # fmt: skip
+    machine: str,
+    since: float,
+    names: tuple[str, ...],
+    every: str | None,
+    only_events: bool,
+    as_csv: bool,
+    as_json: bool,
+    parquet: Path | None,
+) -> None:
     """Show what was estimated and announced before.
 
     FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
@@ -192,9 +198,12 @@ def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
 
 
 def _print_json(
-    reader: "HistoryReader", interval: str, since: float,
-    samples: "Iterable[HistorySample]", events: "Iterable[EventDocument]",
-) -> None:  # fmt: skip
+    reader: "HistoryReader",
+    interval: str,
+    since: float,
+    samples: "Iterable[HistorySample]",
+    events: "Iterable[EventDocument]",
+) -> None:
     content = {
         "machine": reader.machine,
         "site": reader.site,
@@ -210,9 +219,15 @@ def _print_json(
 
 
 def _print_table(
-    reader: "HistoryReader", interval: str, since: float, samples: "Sequence[HistorySample]",
-    events: "Sequence[EventDocument]", bundles: "Mapping[int | None, Path]", *, with_findings: bool,
-) -> None:  # fmt: skip
+    reader: "HistoryReader",
+    interval: str,
+    since: float,
+    samples: "Sequence[HistorySample]",
+    events: "Sequence[EventDocument]",
+    bundles: "Mapping[int | None, Path]",
+    *,
+    with_findings: bool,
+) -> None:
     from rich.console import Console
 
     from otolith.cli.operation.live_table import event_style

@@ -126,9 +126,14 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def drop_in(
-    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *,
-    command: bool = False, networks: Sequence[str] | None = None,
-) -> str:  # fmt: skip
+    name: str,
+    drivers: Sequence[Table],
+    listen: Endpoints,
+    connect: Endpoints,
+    *,
+    command: bool = False,
+    networks: Sequence[str] | None = None,
+) -> str:
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
     ``command``: the daemon runs one for each event, which may use the network of this computer. ``networks`` are those
