@@ -28,7 +28,7 @@ def test_what_is_left_is_what_the_basis_leaves(kind: str, size: float) -> None:
         residuals = size * random.normal(size=len(columns))
         basis = orthonormal_basis(columns)
         left = residuals - basis @ (basis.T @ residuals)
-        total = residuals @ residuals
+        total = float(residuals @ residuals)
         assert chi_square_left(columns, residuals) == pytest.approx(left @ left, abs=1e-10 * total)
 
 
