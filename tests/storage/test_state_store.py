@@ -242,6 +242,14 @@ def test_a_file_in_the_place_of_a_folder_is_named(store: StateStore) -> None:
         store.lock()
 
 
+def test_a_folder_in_the_place_of_a_temporary_file_is_named(store: StateStore) -> None:
+    store.save(STATE)
+    (store.components_path.parent / f"{store.components_path.name}.new").mkdir()
+    with pytest.raises(ServiceError, match=r"here\.motor\.json\.new beside it is a folder: remove or"):
+        store.save(with_friction(-0.001))
+    assert store.components() == SAVED
+
+
 def test_a_folder_that_must_not_be_searched_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the folder of another user: units and kernels are then not cached."""
     monkeypatch.setattr(Path, "exists", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))

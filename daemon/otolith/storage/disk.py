@@ -96,8 +96,13 @@ def replace_file(path: Path, data: bytes, temporary: str) -> None:
     """
     try:
         with opened_folder(path.parent) as folder:
-            with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
-                os.unlink(temporary, dir_fd=folder)
+            try:
+                os.unlink(temporary, dir_fd=folder)  # left by a process that was killed
+            except FileNotFoundError:
+                pass
+            except IsADirectoryError as error:
+                text = f"{path}: cannot be written: {temporary} beside it is a folder: remove or rename it"
+                raise ServiceError(text) from error
             try:
                 handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600, dir_fd=folder)
                 with os.fdopen(handle, "wb") as stream:
