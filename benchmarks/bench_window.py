@@ -19,7 +19,7 @@ from otolith.estimation.information import initial_prior
 from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import Search, estimate
+from otolith.estimation.window_fit import SwarmSearch, estimate
 from otolith.machine import find_twin, load_machine
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.plant.scenario import load_scenario
@@ -86,8 +86,8 @@ def main(*, quick: bool) -> int:
         free = with_free(problem, names)
         start = np.array([parameter.nominal for parameter in free.free])
         prior = initial_prior(free)
-        cold = median_seconds(partial(estimate, free, record[-1], prior, start, Search.FROM_BOUNDS), 5)
-        warm = median_seconds(partial(estimate, free, record[-1], prior, start, Search.IF_UNEXPLAINED), 50)
+        cold = median_seconds(partial(estimate, free, record[-1], prior, start, SwarmSearch.FROM_BOUNDS), 5)
+        warm = median_seconds(partial(estimate, free, record[-1], prior, start, SwarmSearch.IF_UNEXPLAINED), 50)
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)
         kernel = median_seconds(partial(objective.linearise, guess), 200)

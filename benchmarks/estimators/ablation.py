@@ -21,7 +21,7 @@ from otolith.estimation.information import initial_prior
 from otolith.estimation.minimisers import gauss_newton, search_parameters
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import Search, estimate
+from otolith.estimation.window_fit import SwarmSearch, estimate
 
 WINDOWS = 10  # machines, over which the starts are distributed
 CHI_SQUARE_TOLERANCE, RELATIVE_TOLERANCE = (
@@ -75,7 +75,9 @@ def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, .
     whole = np.array(
         [
             parameter.value
-            for parameter in estimate(problem, window, initial_prior(problem), start, Search.FROM_BOUNDS).parameters
+            for parameter in estimate(
+                problem, window, initial_prior(problem), start, SwarmSearch.FROM_BOUNDS
+            ).parameters
         ]
     )
     both = Attempt(whole, time.perf_counter() - begin)

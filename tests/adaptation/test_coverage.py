@@ -7,7 +7,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation.information import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import Search, estimate
+from otolith.estimation.window_fit import SwarmSearch, estimate
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -60,7 +60,9 @@ def test_95_percent_intervals_cover_the_truth(names: tuple[str, ...], windows: i
     inside, pulls = np.zeros(len(free)), []
     for index in range(windows):
         record, initial = window(random, index)
-        estimates = estimate(problem, record, initial_prior(problem), 1.1 * truth, Search.IF_UNEXPLAINED).parameters
+        estimates = estimate(
+            problem, record, initial_prior(problem), 1.1 * truth, SwarmSearch.IF_UNEXPLAINED
+        ).parameters
         errors = np.array([parameter.value for parameter in estimates]) - truth
         inside += np.abs(errors) <= 1.959964 * np.array([parameter.sd for parameter in estimates])
         pulls.append(errors / cramer_rao_bound(problem, record, initial))

@@ -11,7 +11,7 @@ from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.information import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import MAX_CHANGE, Problem, WindowOptions
-from otolith.estimation.window_fit import Search, estimate
+from otolith.estimation.window_fit import SwarmSearch, estimate
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -73,7 +73,9 @@ def test_95_percent_intervals_cover_the_truth_at_random_times(missing: float) ->
     inside = np.zeros(len(FREE))
     for index in range(windows):
         record = window(random, index, missing)
-        estimates = estimate(PROBLEM, record, initial_prior(PROBLEM), 1.1 * EXPECTED, Search.IF_UNEXPLAINED).parameters
+        estimates = estimate(
+            PROBLEM, record, initial_prior(PROBLEM), 1.1 * EXPECTED, SwarmSearch.IF_UNEXPLAINED
+        ).parameters
         errors = np.array([parameter.value for parameter in estimates]) - EXPECTED
         inside += np.abs(errors) <= 1.959964 * np.array([parameter.sd for parameter in estimates])
     share = inside / windows

@@ -13,7 +13,7 @@ from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import Identifiability, inflation_of, initial_prior
 from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem, SwarmOptions
-from otolith.estimation.window_fit import Search, WindowEstimate, estimate
+from otolith.estimation.window_fit import SwarmSearch, WindowEstimate, estimate
 from otolith.health.schema import Status
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -33,7 +33,7 @@ def problem_for(*names: str) -> Problem:
 
 
 def estimated(
-    problem: Problem, window: Window, start: list[float], search: Search = Search.FROM_BOUNDS
+    problem: Problem, window: Window, start: list[float], search: SwarmSearch = SwarmSearch.FROM_BOUNDS
 ) -> WindowEstimate:
     return estimate(problem, window, initial_prior(problem), np.array(start), search)
 
@@ -202,7 +202,7 @@ def test_input_noise_widens_the_interval(scenario: MotorScenario, windows: Cut) 
         changed = scenario.model_copy(update={"seed": seed, "faults": ()})
         window, _ = windows(changed, 5)[-1]
         for modelled, problem in ((True, noisy_input), (False, problem_for("R_a"))):
-            resistance = estimated(problem, window, [6.5], Search.IF_UNEXPLAINED).parameters[0]
+            resistance = estimated(problem, window, [6.5], SwarmSearch.IF_UNEXPLAINED).parameters[0]
             inside[modelled] += abs(resistance.value - 6.5) <= 1.96 * resistance.sd
     assert inside[True] >= 0.87 * count  # 0.5 % quantile of the binomial distribution for 95 %
     assert inside[False] < 0.75 * count

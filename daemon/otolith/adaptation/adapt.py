@@ -45,7 +45,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
 from otolith.estimation.timing import with_changes_between
 from otolith.estimation.window_fit import (
-    Search,
+    SwarmSearch,
     WindowEstimate,
     estimate,
     estimate_window,
@@ -100,7 +100,7 @@ class _TestedEstimate:
     innovation: Innovation
 
     @classmethod
-    def of(cls, predicted: Posterior, window: Window, search: Search = Search.NEVER) -> "_TestedEstimate":
+    def of(cls, predicted: Posterior, window: Window, search: SwarmSearch = SwarmSearch.NEVER) -> "_TestedEstimate":
         """Estimate from ``window`` under its prediction, and compare the two."""
         estimated = estimate_window(predicted, window, search)
         return cls(predicted, estimated, predicted.innovation(estimated.evidence))
@@ -116,7 +116,7 @@ def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWind
 
     If the window is not expected because a sensor is saturated, the other samples are estimated from.
     """
-    search = Search.NEVER if some_parameter_is_determined(state.previous) else Search.FROM_BOUNDS
+    search = SwarmSearch.NEVER if some_parameter_is_determined(state.previous) else SwarmSearch.FROM_BOUNDS
     tested = _TestedEstimate.of(predicted, checked.window, search)
     saturated: tuple[FaultySensor, ...] = ()
     if not tested.is_expected and (rest := without_saturated(predicted, checked.window)) is not None:
@@ -231,7 +231,7 @@ def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test:
     filter is one of the hypotheses. Hypotheses that explain no window have none to weigh against it.
     """
     result = _update_filter(state, tested)
-    if test.filter_evidence.is_for or test.best.type is FaultType.NOTHING or not test.has_explained:
+    if test.filter_evidence.is_for or test.best.type is FaultType.NOTHING or not test.has_explained_unexpected:
         return result
     return _with_mixture(replace(result, test=test.after_expected()), state.problem)
 

@@ -117,7 +117,7 @@ class WindowResult:
     @property
     def is_explained(self) -> bool:
         """Whether the best hypothesis of an open test explains the window up to the noise."""
-        return self.test is None or self.test.explains
+        return self.test is None or self.test.explains_window
 
     def contradictions(self, state: AdaptationState) -> int:
         """Return how many windows in a row, with this one, did not update the posterior; bad data are not counted."""
@@ -320,7 +320,7 @@ def _component_document(
 
 def _explanations(test: SequentialTest | None) -> tuple[AlternativeDocument, ...]:
     """Return the competing hypotheses, the most probable first; none if even that does not explain the window."""
-    if test is None or test.best.type is FaultType.NOTHING or not test.explains:
+    if test is None or test.best.type is FaultType.NOTHING or not test.explains_window:
         return ()
     best = Alternative(test.best.type, describe_hypothesis(test.best), test.probabilities[0])
     return _alternative_documents((best, *alternatives_of(test, test.best)), 1.0 - test.wrong_probability)
@@ -403,7 +403,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         kind=kind,
         subject=subject,
         severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
-        condition=condition if test.explains else NOT_EXPLAINED,
+        condition=condition if test.explains_window else NOT_EXPLAINED,
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
         advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
@@ -435,7 +435,7 @@ def _moved_known(test: SequentialTest) -> str:
     names = {parameter.name for parameter in test.best.problem.free} & {name for name, _ in test.problem.known}
     probable = test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
     is_sure = probable and test.counts.leading >= COMPONENT_WINDOWS
-    is_alone = test.explains and test.best.type is FaultType.PARAMETER and len(names) == 1
+    is_alone = test.explains_window and test.best.type is FaultType.PARAMETER and len(names) == 1
     return names.pop() if is_alone and is_sure else ""
 
 
@@ -475,7 +475,7 @@ def _machine_file_advice(test: SequentialTest) -> str:
 
 def _experiment(test: SequentialTest | None, situation: Situation | None) -> str:
     """Return the experiment that would distinguish the most probable hypothesis from the next one."""
-    if test is None or situation is None or not test.explains:
+    if test is None or situation is None or not test.explains_window:
         return ""
     others = test.alternatives(test.best)
     return deciding_experiment(test.best, others[0][0], situation) if others else ""

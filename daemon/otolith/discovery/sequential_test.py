@@ -143,7 +143,7 @@ class SequentialTest:
     filter_evidence: FilterEvidence = FilterEvidence()
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
-    has_explained: bool = True
+    has_explained_unexpected: bool = True
     """Whether a hypothesis has explained a window that the filter did not expect; else the cause is none of them."""
 
     @property
@@ -173,7 +173,7 @@ class SequentialTest:
         return self.counts.resolved < RESOLVED_WINDOWS or self.has_equal_causes
 
     @property
-    def explains(self) -> bool:
+    def explains_window(self) -> bool:
         """Whether the best hypothesis explains the last window up to the noise."""
         return self.best.cost <= EXPLAINED
 
@@ -190,7 +190,7 @@ class SequentialTest:
     @property
     def wrong_probability(self) -> float:
         """Probability that none of the hypotheses holds; one window alone is as likely to be wrong itself."""
-        is_sure = self.explains and self.counts.since_search > 1
+        is_sure = self.explains_window and self.counts.since_search > 1
         return self.filter_evidence.probability if is_sure else max(self.filter_evidence.probability, WRONG_WINDOW)
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
@@ -211,8 +211,8 @@ class SequentialTest:
 
     def after_unexpected(self) -> "SequentialTest":
         """Return the test after a window that the filter did not expect, or that confirmed the test."""
-        has_explained = self.has_explained or self.explains
-        return replace(self, counts=replace(self.counts, expected=0), has_explained=has_explained)
+        has_explained_unexpected = self.has_explained_unexpected or self.explains_window
+        return replace(self, counts=replace(self.counts, expected=0), has_explained_unexpected=has_explained_unexpected)
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
@@ -236,10 +236,10 @@ def continue_test(test: SequentialTest, predicted: Posterior, screening: Screeni
     Where the tracked hypotheses do not explain the window, a new search adds others: something may have begun since.
     If no hypothesis has explained any window, the test begins again.
     """
-    if not test.has_explained:
+    if not test.has_explained_unexpected:
         return replace(open_test(predicted, screening), onset=test.onset)
     test = follow(test, screening.fitted.window)
-    if test.best.explains_all and test.explains:
+    if test.best.leaves_noise and test.explains_window:
         return test
     return join(test, new_test(search(screening), predicted))
 
@@ -270,7 +270,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         best.fit.window.start,
         last=FitSummary(best.chi_square, least - best.chi_square / variance_factor, variance_factor),
         null_reduced_chi_square=max(null.chi_square / max(count, 1.0), 1.0),
-        has_explained=best.fit.cost <= EXPLAINED,
+        has_explained_unexpected=best.fit.cost <= EXPLAINED,
     )
 
 
@@ -365,7 +365,7 @@ def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisS
     if best is None:
         return hypotheses
     screening = screening_test(best.fitted.fit.linearised_at_end())
-    return (replace(hypotheses[0], explains_all=not screening.is_positive), *hypotheses[1:])
+    return (replace(hypotheses[0], leaves_noise=not screening.is_positive), *hypotheses[1:])
 
 
 def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:

@@ -232,7 +232,7 @@ class WindowEstimate:
     """Whether parameters that stay constant leave more of the window than those with trends."""
 
 
-class Search(Enum):
+class SwarmSearch(Enum):
     """When the particle swarm searches."""
 
     NEVER = "Gauss-Newton starts at the prediction; no swarm"
@@ -240,19 +240,19 @@ class Search(Enum):
     FROM_BOUNDS = "a swarm searches, unless the window is explained and determines no parameter"
 
 
-def estimate_window(predicted: Posterior, window: Window, search: Search = Search.NEVER) -> WindowEstimate:
+def estimate_window(predicted: Posterior, window: Window, search: SwarmSearch = SwarmSearch.NEVER) -> WindowEstimate:
     """Estimate from ``window`` under its prediction.
 
     If no swarm may search and a phase is unknown, the fit of least cost from four starting phases is returned.
     """
     problem, prior = predicted.problem, predicted.prior()
     start = np.clip(prior.mean[: len(problem.free)], *problem.bounds)
-    starts = predicted.with_phases(start) if search is Search.NEVER else [start]
+    starts = predicted.with_phases(start) if search is SwarmSearch.NEVER else [start]
     return min((estimate(problem, window, prior, start, search) for start in starts), key=lambda item: item.cost)
 
 
 def estimate(
-    problem: Problem, window: Window, prior: Prior, start: Array, search: Search = Search.NEVER
+    problem: Problem, window: Window, prior: Prior, start: Array, search: SwarmSearch = SwarmSearch.NEVER
 ) -> WindowEstimate:
     """Estimate the free parameters from ``window``; ``start`` (free,) is where the fit starts.
 
@@ -264,10 +264,10 @@ def estimate(
     if fitted.cost > EXPLAINED >= both.cost:
         both = _leave_local_minimum(both)
     outcome, generations = Outcome.CONTINUED, 0
-    is_unexplained = both.cost > EXPLAINED and search is not Search.NEVER
-    if is_unexplained or (search is Search.FROM_BOUNDS and both.is_informative):
+    is_unexplained = both.cost > EXPLAINED and search is not SwarmSearch.NEVER
+    if is_unexplained or (search is SwarmSearch.FROM_BOUNDS and both.is_informative):
         both, outcome, generations = _search(both)
-    elif search is Search.FROM_BOUNDS:
+    elif search is SwarmSearch.FROM_BOUNDS:
         outcome = Outcome.NOTHING_TO_FIND
     if not both.fit.result.converged and not both.alone.converged:
         outcome = Outcome.UNFINISHED
