@@ -29,12 +29,14 @@ demo: $(RUNTIME)
 unexport PYTHONDONTWRITEBYTECODE
 
 # More processes than cores, as many tests wait for real time. A file's tests stay together and share what they compute.
-WORKERS ?= $(shell expr 3 \* $$(nproc))
+WORKERS ?= $(shell expr 2 \* $$(nproc))
 SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)
 	$(SHARED) -m "not full and not timed"
 
 # Timed tests run last and one at a time, with exact limits.
+# More of these wait for real time.
+test-full: WORKERS = $(shell expr 3 \* $$(nproc))
 test-full: $(DEV)
 	@$(SHARED) -m "full and not timed"; shared=$$?; \
 	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed; timed=$$?; exit $$((shared | timed))
