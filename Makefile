@@ -34,8 +34,8 @@ SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no
 test: $(DEV)
 	$(SHARED) -m "not full and not timed"
 
-# Timed tests run last and one at a time, with exact limits.
-# More of these wait for real time.
+# Full tests wait for real time more than others, so they get more processes. Timed tests run last and one at a time,
+# with exact limits.
 test-full: WORKERS = $(shell expr 3 \* $$(nproc))
 test-full: $(DEV)
 	@$(SHARED) -m "full and not timed"; shared=$$?; \

@@ -179,7 +179,7 @@ class OwnMachine:
         # A drive renews its registers more often than they are read: no value is a whole period old. The age of a value
         # that is renewed as often as it is read varies by that period whenever the computer is late.
         if "modbus" in transport:
-            text = text.replace("seed = ", f'sample_period = "{RENEWAL}"\nseed = ', 1)
+            text = f'sample_period = "{RENEWAL}"\n{text}'
         modbus = f'port = {self.tcp_port}\nline = "{self.line}"\n'
         text = (
             text.replace("[modbus]", f"[modbus]\n{modbus}")

@@ -198,7 +198,7 @@ class TrackedHypothesis:
     delay_sds: tuple[float, ...] = ()  # Standard deviation, in s, of the delay with which each window was fitted
     shift_by_delay: tuple[tuple[str, float], ...] = ()
     """How far the parameters of each label move with that delay, per second; empty if it states none."""
-    leaves_noise: bool = True  # Whether the screening test found nothing in what it left of the last window
+    leaves_only_noise: bool = True  # Whether the screening test found nothing in what it left of the last window
 
     @property
     def type(self) -> FaultType:

@@ -239,7 +239,7 @@ def continue_test(test: SequentialTest, predicted: Posterior, screening: Screeni
     if not test.has_explained_unexpected:
         return replace(open_test(predicted, screening), onset=test.onset)
     test = follow(test, screening.fitted.window)
-    if test.best.leaves_noise and test.explains_window:
+    if test.best.leaves_only_noise and test.explains_window:
         return test
     return join(test, new_test(search(screening), predicted))
 
@@ -365,7 +365,7 @@ def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisS
     if best is None:
         return hypotheses
     screening = screening_test(best.fitted.fit.linearised_at_end())
-    return (replace(hypotheses[0], leaves_noise=not screening.is_positive), *hypotheses[1:])
+    return (replace(hypotheses[0], leaves_only_noise=not screening.is_positive), *hypotheses[1:])
 
 
 def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
