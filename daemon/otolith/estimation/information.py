@@ -239,8 +239,7 @@ class Prior:
     def whitening(self) -> Array:
         """(2 free, 2 free) matrix that makes deviations from the mean independent with unit variance."""
         size = np.sqrt(np.diag(self.covariance))
-        factor = np.linalg.cholesky(self.covariance / np.outer(size, size))
-        return np.asarray(np.linalg.inv(factor) / size)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance / np.outer(size, size))) / size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -115,8 +115,7 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
         beyond = free & ((step < low) | (step > high))
         if not beyond.any():
             break
-        step = np.where(beyond, np.minimum(np.maximum(step, low), high), step)
-        free &= ~beyond
+        step, free = np.where(beyond, np.minimum(np.maximum(step, low), high), step), free & ~beyond
         gradient = first + normal[:, ~free] @ step[~free]
     return step
 
