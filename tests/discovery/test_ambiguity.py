@@ -34,6 +34,12 @@ def test_a_sensor_and_several_moved_parameters_that_explain_the_same_are_equally
     assert interchangeable([sensor, moved, NULL]) == [[0], [1]]
 
 
+def test_fewer_values_do_not_decide_against_a_better_fit() -> None:
+    """Seen on a motor without a current sensor: "omega reads +15 % off" although K, J and T_c had moved."""
+    moved, sensor = stated(FaultType.PARAMETER, 4.0, 0.0, 3), stated(FaultType.SENSOR, 0.0, 11.0, 1, OFFSET)
+    assert shares_of([sensor, moved, NULL]) == pytest.approx([0.5, 0.5, 0.0], abs=1e-6)
+
+
 def test_data_decide_between_a_sensor_and_moved_parameters() -> None:
     moved, sensor = stated(FaultType.PARAMETER, 0.0, 0.0, 3), stated(FaultType.SENSOR, 15.0, 15.0, 1, OFFSET)
     assert shares_of([moved, sensor, NULL])[0] > 0.99

@@ -9,7 +9,7 @@ therefore gains over "parameters only". ``docs/explanation/discovery.md`` has th
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -30,6 +30,7 @@ MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is nois
 MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of parameters; less is a parameter
 MAX_BLOCK = 1 << 21  # residuals times curves that are computed at once: 16 MB
 PROBES = 16  # random vectors by which the length of a projected response is estimated
+PROBE_SETS = 4  # windows in turn have others: what one set underestimates, the next ones do not
 MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
 
 
@@ -217,10 +218,10 @@ class LinearResponse(ProjectedResponse):
         with np.errstate(all="ignore"):
             sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
             sums = sums.reshape(-1, machine_sites, count)  # the real part is that of a cosine, the imaginary of a sine
-            sums /= np.abs(sums[:, :, 1:]).max(axis=2, keepdims=True)  # gains are the same; no square overflows
+            sums /= np.abs(sums.view(np.float64)).max(initial=0.0)  # gains are the same; no square overflows
             b, probes = sums[:, :, 0], sums[:, :, 1:]
-            size = (probes.real**2 + probes.imag**2).mean(axis=2)  # trace of S
-            skew = (probes**2).mean(axis=2)  # S₁₁ - S₂₂ + 2i·S₁₂
+            size = np.einsum("lsp,lsp->ls", probes, probes.conj()).real / PROBES  # trace of S
+            skew = np.einsum("lsp,lsp->ls", probes, probes) / PROBES  # S₁₁ - S₂₂ + 2i·S₁₂
             gains = 2.0 * (size * np.abs(b) ** 2 - (skew.conj() * b**2).real) / (size**2 - np.abs(skew) ** 2)  # bᵀS⁻¹b
         return np.where(np.isfinite(gains), gains, 0.0).T
 
@@ -245,8 +246,8 @@ class LinearResponse(ProjectedResponse):
         The first is with the remainder. The others are with random vectors after projection, whose covariance is the
         projector: their mean square is the squared length of the projected response.
         """
-        random = np.random.default_rng(self.problem.seed + self.window.index)
-        vectors = random.standard_normal((len(self._basis) + len(self._prior_basis), PROBES))
+        rows = len(self._basis) + len(self._prior_basis)
+        vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, rows)
         shared = self._basis.T @ vectors[: len(self._basis)] + self._prior_basis.T @ vectors[len(self._basis) :]
         probes = vectors[: len(self._basis)] - self._basis @ shared
         signals = np.column_stack([self._remainder, probes])
@@ -302,6 +303,12 @@ class LinearResponse(ProjectedResponse):
         wanted, initial = [order.index(name) for name in names], self._guess[objective.free :]
         slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
         return -objective.kernel.whiten(objective.innovation_model, slopes, objective.present)
+
+
+@lru_cache(maxsize=PROBE_SETS)
+def _probes(seed: int, rows: int) -> Array:
+    """Return random vectors (rows, PROBES), which windows of as many records share."""
+    return np.random.default_rng(seed).standard_normal((rows, PROBES))
 
 
 def chi_square_of_parameters(fitted: Fit) -> float:

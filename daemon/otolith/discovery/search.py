@@ -235,7 +235,9 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
         late = replace(null.problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
         return Proposal(stated, late, null.fit.prior, null.fit.prior.mean)
 
-    delays = np.sort(trial_delays(window.sample_period, limit)).tolist()
+    periods = trial_delays(1.0, limit / window.sample_period)
+    # Late by whole periods, regular samples stay in common records: else there would be twice as many.
+    delays = (window.sample_period * np.unique(np.where(np.abs(periods) < 1.0, periods, np.rint(periods)))).tolist()
     (best,) = fit_hypotheses([_best_of_grid(proposal, delays, window)], window)
     for _ in range(DELAY_STEPS):
         ((_, delay),), score = best.problem.delays, delay_score(best.fit, names[index])

@@ -135,7 +135,8 @@ def drop_spikes(
             continue
         column = window.signals.index(name)
         present = np.flatnonzero(~window.missing[:, column])
-        is_spike = spike_records(window.values[present, column], level, times[present])
+        is_even = window.grid.period is not None and len(present) == window.records
+        is_spike = spike_records(window.values[present, column], level, None if is_even else times[present])
         count = int(is_spike.sum())
         if count > MAX_SPIKE_SHARE * len(present):
             text = f"{name} spikes in {count} of {len(present)} records"
@@ -167,17 +168,15 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
     spikes = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 5:
         return spikes
-    steps = np.diff(np.arange(len(values)) if times is None else times)
-    share = steps[1:] / (steps[:-1] + steps[1:])  # of the sample before in the line
+    share, spread = (0.5, 1.0) if times is None else _lines_through_neighbours(times)
     second = values[1:-1] - (share * values[:-2] + (1.0 - share) * values[2:])
-    product = steps[:-1] * steps[1:]
-    spread = np.maximum(product / median(product), 1.0)
     usual = max(MAD_TO_SD * median(np.abs(second)), SECOND_DIFFERENCE_SD * noise)
     usual = max(usual, float(np.finfo(float).eps * np.abs(values).max()))  # of the rounding of numbers
     height = SPIKE_HEIGHT * max(usual, float(np.finfo(float).tiny))
-    high = np.abs(second[1:-1]) > height * spread[1:-1]
+    high = (np.abs(second) > height * spread)[1:-1]
     if not high.any():
         return spikes
+    share = np.broadcast_to(share, len(second))
     before, after = 1.0 - share[:-2], share[2:]  # of the spike in the lines through the samples before and after
     with np.errstate(divide="ignore", invalid="ignore"):
         first, last = second[:-2] / second[1:-1], second[2:] / second[1:-1]
@@ -185,6 +184,16 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
     highest = (np.abs(first) < 1.0) & (np.abs(last) < 1.0)  # close in time to a spike, a sample seems to be one too
     spikes[2:-2] = high & shaped[0] & shaped[1] & highest
     return spikes
+
+
+def _lines_through_neighbours(times: Array) -> tuple[Array, Array]:
+    """Return the share of the sample before in each line through two neighbours (lines,), and how far it spreads.
+
+    ``times`` (samples,) are those of the samples; the spread is relative to that of an ordinary pair of steps.
+    """
+    steps = np.diff(times)
+    product = steps[:-1] * steps[1:]
+    return steps[1:] / (steps[:-1] + steps[1:]), np.maximum(product / median(product), 1.0)
 
 
 def median(values: Array) -> float:
@@ -323,7 +332,7 @@ def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices],
     second = np.abs(np.convolve(np.pad(samples, 1, mode="edge"), (-0.5, 1.0, -0.5), mode="valid"))
     top, high = samples.max(), samples >= samples.max() - PILE_WIDTH * noise
     for _ in range(PILE_ROUNDS):
-        deviation = max(noise, MAD_TO_SD * float(np.median(second[high])) / SECOND_DIFFERENCE_SD)
+        deviation = max(noise, MAD_TO_SD * median(second[high]) / SECOND_DIFFERENCE_SD)
         high = samples >= top - PILE_WIDTH * deviation
     edges = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
     runs = zip(edges[::2], edges[1::2], strict=True)

@@ -14,6 +14,7 @@ Filtering Theory, section 9.3).
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from itertools import islice, takewhile
 
 import numpy as np
@@ -227,12 +228,18 @@ def classify(
     return Identifiability.WEAK, weak + bound
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: the fits of a window share the whitening
 class Prior:
     """A normal distribution of the parameters at the end of a window, then of their trends per second."""
 
     mean: Array  # (2 free,)
     covariance: Array  # (2 free, 2 free)
+
+    @cached_property
+    def whitening(self) -> Array:
+        """(2 free, 2 free) matrix that makes deviations from the mean independent with unit variance."""
+        size = np.sqrt(np.diag(self.covariance))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance / np.outer(size, size))) / size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,7 +295,7 @@ class MapObjective:
         self.high = np.concatenate([objective.high[:free], reach, objective.high[free:]])
         self._objective = objective
         self._mean = prior.mean
-        self._whitening = _whitening(prior.covariance)
+        self._whitening = prior.whitening
         self._prior_jacobian = np.zeros((len(prior.mean), len(self.low)))
         self._prior_jacobian[:, : len(prior.mean)] = self._whitening
 
@@ -365,10 +372,3 @@ def _with_noise(root: Array, residual: Array, noise: Array) -> tuple[Array, Arra
     basis, sizes, _ = np.linalg.svd(noise, full_matrices=False)
     share = 1.0 - 1.0 / np.hypot(1.0, sizes)
     return root - (basis * share) @ (basis.T @ root), residual - (basis * share) @ (basis.T @ residual)
-
-
-def _whitening(covariance: Array) -> Array:
-    """Return the matrix (n, n) that makes deviations of ``covariance`` (n, n) independent with unit variance."""
-    size = np.sqrt(np.diag(covariance))
-    factor = np.linalg.cholesky(covariance / np.outer(size, size))
-    return np.asarray(np.linalg.inv(factor) / size)

@@ -102,22 +102,21 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
     Entries at a bound that the gradient pushes outward stay there. Entries that the step would carry beyond a bound go
     to the bound, and the others are solved for again.
     """
-    guess, residuals, jacobian = reached.guess, reached.residuals, reached.jacobian
-    gradient = jacobian.T @ residuals
-    free = ~(((guess <= objective.low) & (gradient > 0.0)) | ((guess >= objective.high) & (gradient < 0.0)))
-    step = np.zeros(len(guess))
+    jacobian, low, high = reached.jacobian, objective.low - reached.guess, objective.high - reached.guess
+    first, normal = jacobian.T @ reached.residuals, jacobian.T @ jacobian
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
+    damped = normal + np.diag(damping * size**2)
+    free = ~(((low >= 0.0) & (first > 0.0)) | ((high <= 0.0) & (first < 0.0)))
+    step, gradient = np.zeros(len(first)), first
     while free.any():
-        normal = jacobian[:, free].T @ jacobian[:, free]
-        root = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
-        scaled = normal / (root[:, None] * root)
-        scaled.flat[:: len(root) + 1] += damping
+        root = size[free]
+        scaled = damped[free][:, free] / (root[:, None] * root)
         step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
-        beyond = free & ((guess + step < objective.low) | (guess + step > objective.high))
+        beyond = free & ((step < low) | (step > high))
         if not beyond.any():
             break
-        step[beyond] = np.clip(guess + step, objective.low, objective.high)[beyond] - guess[beyond]
-        free &= ~beyond
-        gradient = jacobian.T @ (residuals + jacobian[:, ~free] @ step[~free])
+        step, free = np.where(beyond, np.minimum(np.maximum(step, low), high), step), free & ~beyond
+        gradient = first + normal[:, ~free] @ step[~free]
     return step
 
 

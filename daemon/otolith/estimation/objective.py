@@ -144,7 +144,7 @@ class Objective:
 
     def parameters(self, guesses: Array) -> Array:
         """Return all parameters of the twin (particles, parameters) for guesses (particles, free, ...)."""
-        parameters = np.repeat(self._template[None, :], len(guesses), axis=0)
+        parameters = self._template[None].repeat(len(guesses), axis=0)
         parameters[:, self._free_columns] = guesses[:, : self.free]
         return parameters
 
@@ -192,11 +192,12 @@ class Objective:
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
+        prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
         with np.errstate(over="ignore", invalid="ignore"):
-            prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
-            residuals = self.residuals(prediction.outputs[None])[0].ravel()
+            errors = (prediction.outputs - self.measured)[..., None]
+            residuals = self.kernel.whiten(self.innovation_model, errors, self.present).ravel()
         jacobian = self.kernel.whiten(self.innovation_model, prediction.slopes, self.present)
-        if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
+        if all(np.vdot(numbers, numbers) <= PENALTY**2 for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
 

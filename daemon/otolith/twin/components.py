@@ -58,24 +58,17 @@ class SourceRange:
     high: float
     smallest: float  # Least magnitude
     step: float  # Largest change from record to record
+    width: float  # From the lowest value to the highest
+    largest: float  # Largest magnitude
 
     @classmethod
     def of_each(cls, x: Array) -> "list[SourceRange]":
         """Return the range of each row of ``x`` (sources, records); NaN separates windows."""
         steps = np.fmax.reduce(np.abs(np.diff(x)), axis=1, initial=0.0)
         smallest = np.fmin.reduce(np.abs(x), axis=1)
-        columns = (np.fmin.reduce(x, axis=1), np.fmax.reduce(x, axis=1), smallest, steps)
-        return [cls(*row) for row in np.array(columns).T.tolist()]
-
-    @property
-    def width(self) -> float:
-        """From the lowest value to the highest."""
-        return self.high - self.low
-
-    @property
-    def largest(self) -> float:
-        """Largest magnitude."""
-        return max(-self.low, self.high)
+        low, high = np.fmin.reduce(x, axis=1), np.fmax.reduce(x, axis=1)
+        columns = np.array((low, high, smallest, steps, high - low, np.maximum(-low, high)))
+        return [cls(*row) for row in columns.T.tolist()]
 
 
 @dataclass(frozen=True, slots=True)
