@@ -149,12 +149,10 @@ def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
     problem, slot = hypothesis.problem, len(hypothesis.problem.components) - 1
     if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family == "linear":
         return False
-    into = site_of(problem.base_model, problem.components[slot].site).into
+    site = site_of(problem.base_model, problem.components[slot].site)
     error = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
-    return any(
-        output.name == into and error < noise
-        for output, noise in zip(problem.base_model.outputs, problem.noise, strict=True)
-    )
+    rows = zip(problem.base_model.outputs, problem.noise, strict=True)
+    return any(output.name == site.into and site.through == "1" and error < noise for output, noise in rows)
 
 
 def _all_moved(test: SequentialTest) -> TrackedHypothesis | None:
