@@ -32,7 +32,7 @@ from otolith.machine_file import (
     own_keys,
     signal_units,
 )
-from otolith.twin.components import FAMILY_NAMES, sensor_site, sites, sources
+from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, Sampling, sampling_of
@@ -459,7 +459,7 @@ def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> froz
     families = allowed("families", table.families, FAMILY_NAMES)
     allowed_sites = allowed("sites", table.sites, [site.name for site in twin.sites])
     allowed_inputs = allowed("inputs", table.inputs, [name for name in inputs if name])
-    doubted = {sensor_site(name) for name in allowed("sensors", table.sensors, twin.signals)}
+    doubted = {of(name) for name in allowed("sensors", table.sensors, twin.signals) for of in (sensor_site, gain_site)}
 
     def is_allowed(site: str, family: str, name: str) -> bool:
         of_site = site in allowed_sites and family in families and (not name or name in allowed_inputs)

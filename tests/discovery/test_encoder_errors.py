@@ -65,6 +65,17 @@ def test_at_constant_speed_force_and_encoder_are_one_class(seed: int, force: flo
     assert any(map(states_both, documents))
 
 
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.full) for seed in (1, 2, 4, 5, 6, 7))])
+@pytest.mark.parametrize(("force", "error"), [(FORCE, 0.0), (0.0, ERROR), (0.0, 6e-6)], ids=("force", "13 um", "6 um"))
+def test_where_nothing_shows_the_mass_neither_force_nor_encoder_is_a_verdict(
+    seed: int, force: float, error: float
+) -> None:
+    """At constant speed only a known mass distinguishes them: the estimate of one that nothing excites is anything."""
+    _, documents = run(STATED, steady(14, force, error, seed))
+    assert not any(document.components for document in documents)
+    assert not any(document.decision is WindowDecision.SENSOR for document in documents)
+
+
 def states_both(document: ReportDocument) -> bool:
     """Whether force and encoder are equally probable."""
     leading = document.explanations[:2]

@@ -59,7 +59,7 @@ def candidate_table(base: Definition, taken: frozenset[str]) -> tuple[CandidateF
         for model in COMPONENT_FAMILIES
         for number, source in enumerate(sources(base))
         if source.kind in model.inputs
-        and (index < machine_sites or _is_sensor_error(model, source, site.into))
+        and (index < machine_sites or (site.through == "1" and _is_sensor_error(model, source, site.into)))
         and key_of(site.name, model.name, source.name) not in taken
     )
 

@@ -23,7 +23,7 @@ from otolith.discovery.screening import (
     inner_grid,
 )
 from otolith.estimation.problem import Component, Problem, key_of
-from otolith.twin.components import sensor_site, sites, sources
+from otolith.twin.components import measured_speeds, sites, sources
 
 FINE = 0.5  # spectral lines between two frequencies
 PEAKS = 3  # best grid points whose neighbourhood is searched
@@ -68,20 +68,22 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     return [Candidate(component, competing.of(form), competing.is_sensor(form)) for form, component in rows]
 
 
-def errors_of_encoders(response: LinearResponse, beside: Iterable[Component]) -> list[Candidate]:
-    """Return for each measured position of which a component ``beside`` is a sine: that sine, as its sensor's error.
+def periodic_errors(response: LinearResponse, beside: Iterable[Component]) -> list[Candidate]:
+    """Return for each component ``beside`` that is a sine of a place: that sine, as the error of a sensor.
 
-    An error that is itself among the components ``beside`` is not returned again.
+    That is the sensor of the place or of its speed. An error that is itself ``beside`` is not returned again.
     """
     problem, twin, starts = response.problem, response.problem.base_model, dict[CandidateForm, list[float]]()
-    site_names, source_names = [site.name for site in sites(twin)], [source.name for source in sources(twin)]
+    source_names = [source.name for source in sources(twin)]
     components, signals = {own.key: own for own in beside}, {output.name for output in twin.outputs}
     for sine in components.values():
-        error = key_of(sensor_site(sine.source), sine.family, sine.source)
-        if sine.periodic and sine.source in signals and error not in problem.excluded | components.keys():
-            site, source = site_names.index(sensor_site(sine.source)), source_names.index(sine.source)
-            form = CandidateForm(site, sine.model, source, (sine.low, sine.high))
-            starts.setdefault(form, []).append(sine.inner)
+        read = signals & {sine.source, measured_speeds(twin).get(sine.source)}
+        for at, site in enumerate(sites(twin)):
+            error = key_of(site.name, sine.family, sine.source)
+            is_error = sine.periodic and at >= len(twin.sites) and site.into in read
+            if is_error and error not in problem.excluded | components.keys():
+                form = CandidateForm(at, sine.model, source_names.index(sine.source), (sine.low, sine.high))
+                starts.setdefault(form, []).append(sine.inner)
     if not starts:
         return []
     competing = CompetingForms.among(problem, list(starts))
@@ -160,7 +162,8 @@ def _without_parameters(
     amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
-    gains = {guess.form: _gain(guess, competing) for guess in guesses if guess.form.model.name == "constant"}
+    constants = [guess for guess in guesses if guess.form.model.name == "constant"]
+    gains = {own.form: own.score + 2.0 * float(np.log(competing.of(own.form))) for own in constants}  # without prior
     offsets = [gain for form, gain in gains.items() if competing.is_sensor(form)]
     causes = {
         form
@@ -172,11 +175,6 @@ def _without_parameters(
         for guess, at in zip(guesses, first, strict=True)
         if competing.is_sensor(guess.form) or guess.form in causes or not same[at]
     ]
-
-
-def _gain(guess: ScoredGuess, competing: CompetingForms) -> float:
-    """Return the score of a guess without its prior weight."""
-    return guess.score + 2.0 * float(np.log(competing.of(guess.form)))
 
 
 def _affordable(response: ProjectedResponse) -> int:

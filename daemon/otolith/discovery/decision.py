@@ -14,7 +14,7 @@ from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Component, indices, site_of, slot_of
+from otolith.estimation.problem import INNER_BOUND, Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
@@ -105,6 +105,8 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
     leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
+    if not _is_possible(best):
+        return WindowOutcome(WindowDecision.SUSPECTED, best)
     if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
         return fault
     if _is_component_accepted(test) and (accepted := _without_undecided_terms(test)).type is FaultType.COMPONENT:
@@ -125,6 +127,13 @@ def _data_fault(test: SequentialTest, *, is_young: bool) -> WindowOutcome | None
     return None
 
 
+def _is_possible(hypothesis: TrackedHypothesis) -> bool:
+    """Whether no positive parameter is far beyond its bounds: a mass that nothing excites may become negative."""
+    rows = zip(hypothesis.problem.free, hypothesis.posterior.prior().mean.tolist(), strict=False)  # then come trends
+    own = [(free, value) for free, value in rows if free.low > 0.0 and not free.name.startswith("_")]
+    return all(free.low / INNER_BOUND <= value <= free.high * INNER_BOUND for free, value in own)
+
+
 def _is_component_accepted(test: SequentialTest) -> bool:
     """Whether windows agree on a component, and no other hypothesis explains them as well."""
     leads = test.best.type is FaultType.COMPONENT and test.counts.leading >= COMPONENT_WINDOWS
@@ -140,12 +149,10 @@ def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
     problem, slot = hypothesis.problem, len(hypothesis.problem.components) - 1
     if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family == "linear":
         return False
-    into = site_of(problem.base_model, problem.components[slot].site).into
+    site = site_of(problem.base_model, problem.components[slot].site)
     error = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
-    return any(
-        output.name == into and error < noise
-        for output, noise in zip(problem.base_model.outputs, problem.noise, strict=True)
-    )
+    rows = zip(problem.base_model.outputs, problem.noise, strict=True)
+    return any(output.name == site.into and site.through == "1" and error < noise for output, noise in rows)
 
 
 def _all_moved(test: SequentialTest) -> TrackedHypothesis | None:

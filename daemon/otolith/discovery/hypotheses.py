@@ -213,7 +213,9 @@ class TrackedHypothesis:
     @property
     def places(self) -> tuple[str, ...]:
         """Sites of its components and signals of its delays."""
-        return (*(item.site for item in self.problem.components), *(signal for signal, _ in self.problem.delays))
+        twin, read = self.problem.base_model, self.type is FaultType.SENSOR
+        own = [site_of(twin, item.site).into if read else item.site for item in self.problem.components]
+        return (*own, *(signal for signal, _ in self.problem.delays))
 
     def known(self, problem: Problem) -> Prior:
         """Return what is known of the free parameters of ``problem`` under the hypothesis.

@@ -339,7 +339,8 @@ def promising_guesses(response: LinearResponse, forms: list[CandidateForm], comp
     """
 
     def least(form: CandidateForm) -> float:
-        return ESTIMATE_SHARE * (DECISIVE + _penalty(form, competing, response.objective.count))
+        penalty = _parameter_count(form) * np.log(response.objective.count) + 2.0 * np.log(3.0 * competing.of(form))
+        return ESTIMATE_SHARE * (DECISIVE + float(penalty))
 
     lines: list[tuple[float, Guess]] = []
     for form, grid, gains in _spectra(response, [form for form in forms if len(form.model.phases) > 1], COARSE):
@@ -385,8 +386,3 @@ def _spectra(
         grid = inner_grid(of_source[0], response.x, fineness)
         gains = response.estimated_gains(source, grid)
         yield from ((form, grid, gains[form.site]) for form in of_source)
-
-
-def _penalty(form: CandidateForm, competing: CompetingForms, count: float) -> float:
-    """Return what is subtracted from the gain of a form, in -2 log evidence of ``count`` measured values."""
-    return float(_parameter_count(form) * np.log(count) + 2.0 * np.log(3.0 * competing.of(form)))

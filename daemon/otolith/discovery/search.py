@@ -15,8 +15,8 @@ from otolith.discovery.candidates import (
     MAX_CANDIDATES,
     Candidate,
     components_of,
-    errors_of_encoders,
     find_candidates,
+    periodic_errors,
     threshold_like,
 )
 from otolith.discovery.hypotheses import (
@@ -145,13 +145,13 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     window convincingly.
     """
     fitted = _single_causes(screening)
-    fitted += _errors_of_encoders(screening, fitted)
+    fitted += _periodic_errors(screening, fitted)
     if _convincing(fitted) is None:
         fitted += _several_moved(fitted)
     fitted += _several_components(fitted)
     if screening.always_lacking or _convincing(fitted) is None:
         fitted += _always_lacking(fitted[0])
-    fitted += _errors_of_encoders(screening, fitted)
+    fitted += _periodic_errors(screening, fitted)
     return _without_local_minima(fitted)
 
 
@@ -161,7 +161,7 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals = [nothing_happened(problem, prior)]
     if len(problem.free) > 1:
         proposals.append(all_parameters_moved(problem, prior.mean))
-    proposals += _one_parameter_moved(problem, prior, screening.response)
+    proposals += [_moved(problem, prior, *row) for row in _would_explain_most(problem, screening.response)]
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     gains = screening.response.score_delays().gain
@@ -169,14 +169,11 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     return [*fitted, *uncertain, *late_signals(fitted[0], gains)]
 
 
-def _errors_of_encoders(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Fit beside components that are sines of a measured position the same error of its sensor, if none is ``fitted``.
-
-    A force must not be preferred to the error of an encoder because no other hypothesis is periodic.
-    """
+def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Fit beside sines of a place the same errors of sensors: else a force wins for want of a periodic alternative."""
     known, own = fitted[0].problem.components, screening.fitted
     added = [component for item in fitted for component in item.problem.components if component not in known]
-    errors = errors_of_encoders(screening.response, added)
+    errors = periodic_errors(screening.response, added)
     return fit_hypotheses([with_candidate(own.problem, own.prior, error) for error in errors], own.window, FAR_WORSE)
 
 
@@ -279,11 +276,6 @@ def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
     gain = null.deviance(count, variance_factor) - best.deviance(count, variance_factor)
     added = len(best.problem.components) - len(null.problem.components)
     return best if gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count else None
-
-
-def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearResponse) -> list[Proposal]:
-    """Propose that one parameter, estimated or known, has moved: those that would explain most."""
-    return [_moved(problem, prior, name, number) for name, number in _would_explain_most(problem, response)]
 
 
 def _would_explain_most(problem: Problem, response: LinearResponse) -> list[tuple[str, int]]:

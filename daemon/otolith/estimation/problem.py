@@ -287,5 +287,6 @@ def equation(twin: Definition, component: Component, values: Sequence[float]) ->
     phase = f"{'-' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)
     text = text.replace("--", "")  # exp(--0.1·x) is exp(0.1·x)
-    unit = site_of(twin, component.site).unit
-    return text if unit == "1" else f"{text} {unit}"
+    site = site_of(twin, component.site)
+    text = f"{text}·{site.into}" if site.through == site.into else text  # in proportion to what a sensor shows
+    return text if site.unit == "1" else f"{text} {site.unit}"

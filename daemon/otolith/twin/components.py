@@ -217,18 +217,32 @@ class ComponentSource:
 
 @lru_cache(maxsize=64)
 def sites(base: Definition) -> tuple[Site, ...]:
-    """The author's sites, then one for the error of each sensor: outputs, then inputs."""
+    """The author's sites, one for the error of each sensor, outputs, then inputs, and those of :func:`gain_site`."""
     names = [*(output.name for output in base.outputs), *(driven.name for driven in base.inputs)]
-    sensors = [(name, sensor_site(name)) for name in names]
+    sensors, gains = [(name, sensor_site(name)) for name in names], dict.fromkeys(measured_speeds(base).values())
     return (
         *base.sites,
         *(Site(sensor, base.unit_of(name), f"error of the {sensor}", name, "additive") for name, sensor in sensors),
+        *(Site(gain_site(name), "1", f"error of the {gain_site(name)}", name, "additive", name) for name in gains),
     )
 
 
 def sensor_site(signal: str) -> str:
     """Return the name of the site of errors of the sensor of ``signal``."""
     return f"sensor of {signal}"
+
+
+def gain_site(speed: str) -> str:
+    """Return the name of the site of errors in proportion to a measured ``speed``, as of an eccentric encoder."""
+    return f"gain of {speed}"
+
+
+def measured_speeds(base: Definition) -> dict[str, str]:
+    """Return the name of each place whose speed is a state that a sensor shows, and that of the speed."""
+    rates = {left[4:-1]: text.strip() for left, text in base.equations if left.startswith("der(")}
+    rates |= {f"angle({name})": name for name, _ in _speeds(base)}
+    shown = {state.name for state in base.states if _integral_unit(state.unit)} & {row.name for row in base.outputs}
+    return {place: speed for place, speed in rates.items() if speed in shown}
 
 
 @lru_cache(maxsize=64)
@@ -279,14 +293,9 @@ def _speeds(base: Definition) -> list[tuple[str, str]]:
     ]
 
 
-def augmentation_input(site: int) -> str:
-    """The input that is added at a site, by the site's number."""
-    return f"_enter_{site}"
-
-
 def augmentation_inputs(base: Definition) -> tuple[str, ...]:
     """The augmentation inputs, in the order of the sites."""
-    return tuple(augmentation_input(site) for site in range(len(sites(base))))
+    return tuple(f"_enter_{site}" for site in range(len(sites(base))))
 
 
 def component_parameters(slot: int) -> tuple[str, str, str]:

@@ -113,7 +113,7 @@ def system_of(definition: Definition) -> System:
     values: dict[str, sympy.Expr] = {name: _scaled(symbol, scales[name]) for name, symbol in symbols.items()}
     for fixed in definition.constants:
         values[fixed.name] = sympy.Float(fixed.value * scales[fixed.name])
-    entering = _Entering(definition, symbols)
+    entering = _Entering(definition, symbols, values)
     for driven in definition.inputs:
         values[driven.name] -= entering.sensor_error(driven.name)  # the true input drives the twin
     pending = {name: parse(text) for name, text, _ in definition.definitions}
@@ -159,14 +159,15 @@ def _depends(tree: ast.expr, on: Mapping[str, ast.expr]) -> bool:
 class _Entering:
     """What components and augmentation inputs add at the sites of an augmented twin; nothing for any other twin."""
 
-    def __init__(self, definition: Definition, symbols: Mapping[str, sympy.Symbol]) -> None:
+    def __init__(self, definition: Definition, symbols: Mapping[str, sympy.Symbol], values: Values) -> None:
         self._author: list[tuple[Site, sympy.Expr]] = []
         self._sensors: dict[str, sympy.Expr] = {}
         if definition.base is not None:
             entering = list(zip(sites(definition.base), _sums_at_sites(definition.base, symbols), strict=True))
             own = len(definition.base.sites)
             self._author = entering[:own]
-            self._sensors = {site.into: expression for site, expression in entering[own:]}
+            for site, added in entering[own:]:
+                self._sensors[site.into] = self.sensor_error(site.into) + to_sympy(parse(site.through), values) * added
 
     def at(self, left: str, side: sympy.Expr, values: Values) -> sympy.Expr:
         """The right ``side`` of ``left`` with what enters there (Eq. 3 and 18)."""
