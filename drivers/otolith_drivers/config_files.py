@@ -20,6 +20,7 @@ FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times
 Location = Sequence[int | str]  # Keys and list indices that lead to a value
 Model = TypeVar("Model", bound=BaseModel)
 
+NUMBER = (int, float)  # A boolean is an integer as well
 SECTION = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$")
 ASSIGNMENT = re.compile(r"\s*([\w\-.\"' ()]+?)\s*=")
 KEY_PART = re.compile(r"\"[^\"]*\"|'[^']*'|[^.]+")
@@ -76,9 +77,10 @@ class StrictModel(BaseModel):
         """Refuse what pydantic converts (a boolean for a number, a number for a boolean), and zero bytes."""
         kinds = _written_kinds(cls)
         for key, value in table.items() if isinstance(table, dict) else ():
-            if isinstance(value, str) and "\0" in value:
-                raise _ValueFaultError(key, f"{value!r} contains a zero byte")
-            if key in kinds and isinstance(value, bool | int | float):
+            if isinstance(value, str):
+                if "\0" in value:
+                    raise _ValueFaultError(key, f"{value!r} contains a zero byte")
+            elif isinstance(value, NUMBER) and key in kinds:
                 _check_number(key, value, kinds[key])
         return table
 

@@ -165,8 +165,8 @@ class LinearResponse(ProjectedResponse):
         slotted = augmented_model(self.problem.base_model)
         self._kernel = kernel_of(slotted)
         values, states = objective.parameters(self._guess[None])[0], self._guess[free:]
-        parameters = np.pad(values, (0, len(slotted.parameters) - len(values)))
-        initial = np.pad(states, (0, len(slotted.states) - len(states)))
+        parameters, initial = np.zeros(len(slotted.parameters)), np.zeros(len(slotted.states))
+        parameters[: len(values)], initial[: len(states)] = values, states
         gain = np.zeros((self.window.records, len(initial), len(self.problem.base_model.outputs)))
         gain[:, : len(states)] = objective.innovation_model.gain
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
@@ -233,7 +233,7 @@ class LinearResponse(ProjectedResponse):
         with np.errstate(all="ignore"):
             families, source_indices, inners, phases = _columns(shapes)
             curves = self._kernel.curves(families, self.x, source_indices, inners, phases)
-            products = np.tensordot(curves, signals, axes=(0, 0))
+            products = (curves.T @ signals.reshape(len(signals), -1)).reshape(-1, *signals.shape[1:])
             b, probes = products[..., 0], products[..., 1:]
             gains = PROBES * b**2 / np.einsum("csp,csp->cs", probes, probes)
         return np.where(np.isfinite(gains), gains, 0.0)
@@ -301,14 +301,17 @@ class LinearResponse(ProjectedResponse):
         parameters = objective.parameters(self._guess[None])[0]
         wanted, initial = [order.index(name) for name in names], self._guess[objective.free :]
         slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
-        columns = np.where(objective.present[..., None], slopes, 0.0)
-        return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
+        return -objective.kernel.whiten(objective.innovation_model, slopes, objective.present)
 
 
 def chi_square_of_parameters(fitted: Fit) -> float:
     """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
     _, residuals, jacobian = fitted.result.first
-    return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
+    size = np.linalg.norm(jacobian, axis=0)
+    alive = size > 0.0
+    columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
+    triangle: Array = np.asarray(np.linalg.qr(columns, mode="r"))
+    return float(triangle[-1, -1] ** 2)
 
 
 def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:

@@ -4,7 +4,7 @@
 linear response, refines their inner parameters, and fits the best of them jointly with all parameters.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 
@@ -236,7 +236,7 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
         return Proposal(stated, late, null.fit.prior, null.fit.prior.mean)
 
     delays = np.sort(trial_delays(window.sample_period, limit)).tolist()
-    (best,) = fit_hypotheses([_best_of_grid([proposal(delay) for delay in delays], window)], window)
+    (best,) = fit_hypotheses([_best_of_grid(proposal, delays, window)], window)
     for _ in range(DELAY_STEPS):
         ((_, delay),), score = best.problem.delays, delay_score(best.fit, names[index])
         if score.step**2 * score.information < MIN_DELAY_GAIN:
@@ -248,8 +248,8 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
     return best
 
 
-def _best_of_grid(proposals: list[Proposal], window: Window) -> Proposal:
-    """Return the delay that leaves least per measured value.
+def _best_of_grid(proposal: Callable[[float], Proposal], delays: list[float], window: Window) -> Proposal:
+    """Return the proposal of the delay that leaves least per measured value.
 
     Every second one is tried, then the neighbours of the best. Parameters are not fitted: what they explain to first
     order is projected out.
@@ -257,12 +257,12 @@ def _best_of_grid(proposals: list[Proposal], window: Window) -> Proposal:
 
     @cache
     def unexplained(at: int) -> float:
-        item = proposals[at]
+        item = proposal(delays[at])
         fitted = linearised(item.problem, window, item.prior, item.start)
         return chi_square_of_parameters(fitted) / fitted.count
 
-    at = min(range(0, len(proposals), 2), key=unexplained)
-    return proposals[min(range(max(at - 1, 0), min(at + 2, len(proposals))), key=unexplained)]
+    at = min(range(0, len(delays), 2), key=unexplained)
+    return proposal(delays[min(range(max(at - 1, 0), min(at + 2, len(delays))), key=unexplained)])
 
 
 def _chi_square(fitted: FittedHypothesis) -> float:

@@ -12,6 +12,7 @@ All numbers are relative to the sizes of the parameters; :mod:`otolith.estimatio
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ class ImmPosterior:
 def initial_modes(mean: Array, covariance: Array) -> ImmPosterior:
     """Return the bank before the first window; trends have the stationary variance of their mode."""
     free = len(mean) // 2
-    level = _bank(np.full(free, FIRST_LEVEL))
+    level = _bank((FIRST_LEVEL,) * free)
     covariances = np.tile(covariance, (len(level), 1, 1))
     trends = np.arange(free, 2 * free)
     covariances[:, trends, trends] = TREND_NOISE[level] ** 2 * TREND_MEMORY / 2.0
@@ -68,7 +69,7 @@ def initial_modes(mean: Array, covariance: Array) -> ImmPosterior:
 
 def equal_modes(level: Levels, mean: Array, covariance: Array, end: float, variance_ratio: float) -> ImmPosterior:
     """Return a bank around ``level`` (free,) whose modes all have the same mean and covariance."""
-    bank = _bank(np.maximum(level, level.max() - MAX_LEVELS_BELOW))
+    bank = _bank(tuple(np.maximum(level, level.max() - MAX_LEVELS_BELOW).tolist()))
     count = len(bank)
     means, covariances = np.tile(mean, (count, 1)), np.tile(covariance, (count, 1, 1))
     return ImmPosterior(bank, means, covariances, _uniform(count), end, variance_ratio)
@@ -78,8 +79,10 @@ def _uniform(count: int) -> Array:
     return np.full(count, 1.0 / count)
 
 
-def _bank(centre: Levels) -> Levels:
-    """Return the modes (modes, free) around ``centre`` (free,), which comes first, each once."""
+@lru_cache(maxsize=64)
+def _bank(levels: tuple[int, ...]) -> Levels:
+    """Return the modes (modes, free) around the ``levels`` of the first one, each once."""
+    centre = np.array(levels)
     modes = [centre]
     for parameter, level in enumerate(centre):
         for other in sorted({max(level - 1, 0), min(level + 1, HIGHEST_LEVEL), HIGHEST_LEVEL} - {level}):
@@ -286,7 +289,7 @@ def _recentre(posterior: ImmPosterior) -> ImmPosterior:
     best = int(np.where(calmer, posterior.weight / CALMER_FACTOR, posterior.weight).argmax())
     if best == 0:
         return posterior
-    level = _bank(posterior.level[best])
+    level = _bank(tuple(posterior.level[best].tolist()))
     mean, covariance = moment_match(posterior)
     old = {tuple(row): index for index, row in enumerate(posterior.level.tolist())}
     kept = [old.get(tuple(row)) for row in level.tolist()]

@@ -14,7 +14,7 @@ Filtering Theory, section 9.3).
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import islice
+from itertools import islice, takewhile
 
 import numpy as np
 
@@ -164,12 +164,11 @@ def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
     for column, measured in zip(residuals.T, present.T, strict=True):
         series = column if measured.all() else column[measured]
         records = len(series)
-        lags = max(int(MAX_LAG * records), 1)
-        covariances = np.array([series[lag:] @ series[: records - lag] for lag in range(lags)]) / max(records, 1)
-        ends = np.flatnonzero(covariances <= 0.0)
-        correlated = covariances[1 : int(ends[0]) if len(ends) else lags]
-        total = float(covariances[0] + 2.0 * correlated.sum())
-        long_run = max(long_run, total if total > CORRELATED * covariances[0] else float(covariances[0]))
+        lags = range(1, max(int(MAX_LAG * records), 1))
+        covariances = (float(series[lag:] @ series[:-lag]) / records for lag in lags)
+        variance = float(series @ series) / max(records, 1)
+        total = variance + 2.0 * sum(takewhile(lambda covariance: covariance > 0.0, covariances))
+        long_run = max(long_run, total if total > CORRELATED * variance else variance)
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
 
 

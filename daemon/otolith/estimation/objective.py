@@ -53,7 +53,6 @@ class Objective:
         self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
-        self.is_complete = bool(self.present.all())  # Whether every output was measured in every record
         self._seed = problem.seed + window.index
         levels = zip((twin.base or twin).inputs, problem.input_noise, strict=False)
         self._noisy_inputs = [
@@ -196,10 +195,7 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
-            slopes = prediction.slopes
-            if not self.is_complete:
-                slopes = np.where(self.present[..., None], slopes, 0.0)
-            jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
+        jacobian = self.kernel.whiten(self.innovation_model, prediction.slopes, self.present)
         if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
@@ -297,15 +293,13 @@ def _time_offsets(problem: Problem, window: Window) -> dict[str, float]:
 
 def input_matrix(twin: Definition, window: Window) -> Array:
     """Return the inputs (records, inputs) of a twin with or without slots."""
-    columns = [np.zeros((window.records, 0))]
-    for source in twin.inputs:
+    inputs = np.zeros((window.records, len(twin.inputs)))
+    for column, source in enumerate(twin.inputs):
         if source.name == ELAPSED:
-            columns.append(window.grid.offsets[:, None])
-        elif source.name.startswith("_"):
-            columns.append(np.zeros((window.records, 1)))
-        else:
-            columns.append(window.column(source.name)[:, None])
-    return np.hstack(columns)
+            inputs[:, column] = window.grid.offsets
+        elif not source.name.startswith("_"):
+            inputs[:, column] = window.column(source.name)
+    return inputs
 
 
 def rounding_variance(values: Array, noise: float, known_step: float) -> float:
@@ -391,7 +385,7 @@ def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Arra
         if index is not None and present[:, index].any():
             values = measured[present[:, index], index]
             first = float(values[0])
-            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(values)))
+            reach = max(INITIAL_STATE_REACH * noise[index], float(values.max() - values.min()))
             low, high = first - reach, first + reach
             if not present[0, index]:  # the state may have moved before its first measurement
                 low, high = min(low, state.low), max(high, state.high)

@@ -7,6 +7,7 @@ more certain. Where the advance is not known, the phase is reset to unknown.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseA
     return PhaseAdvance(window.start, window.end, tuple(advance), known if np.isfinite(known).all() else ())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: the prior is computed once
 class Posterior:
     """What is known of the free parameters of ``problem``. Plain: it pickles."""
 
@@ -76,6 +77,10 @@ class Posterior:
 
     def prior(self) -> Prior:
         """Return all modes as one normal distribution, in the units of the parameters."""
+        return self._prior
+
+    @cached_property
+    def _prior(self) -> Prior:
         size = _size(self.problem)
         mean, covariance = imm_filter.moment_match(self.belief)
         return Prior(mean * size, covariance * np.outer(size, size))

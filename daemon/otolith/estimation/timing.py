@@ -16,7 +16,7 @@ from otolith.acquisition.samples import Series, interval_of
 from otolith.acquisition.window import Array, BridgeError, Mask, TimeGrid, Window
 from otolith.estimation.objective import Objective
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation
+from otolith.twin.kernel import Excitation, Indices
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-estimation.md.
 SAME_RECORD_STEPS = 1e-6  # mean steps: times that differ by less are one record
@@ -53,21 +53,27 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
     if not len(times):
         return window
     grid = _grid(times, end, tolerance)
-    values, missing, errors = [], [], []
-    ramps = {driven.name for driven in twin.inputs if driven.hold == "foh"}
-    for signal in window.signals:
-        sampled = window.grid.offsets - delays.get(signal, 0.0)
-        before = np.clip(np.searchsorted(sampled, times + tolerance, side="right") - 1, 0, len(sampled) - 1)
-        is_between = np.abs(times - sampled[before]) > tolerance  # two samples of the signal
-        value = window.column(signal)[before]
-        if signal in ramps:
-            value = np.where(is_between, np.interp(times, sampled, window.column(signal)), value)
-        values.append(value)
-        missing.append(is_between | window.missing_in(signal)[before])
-        errors.append(_bridge_error(window, signal, before, grid.steps))
-    error = BridgeError(*(np.column_stack(columns) for columns in zip(*errors, strict=True)))
-    whole = replace(window, start=window.start + float(times[0]), grid=grid)
-    return replace(whole, values=np.column_stack(values), missing=np.column_stack(missing), bridge_error=error)
+    late = [delays.get(signal, 0.0) for signal in window.signals]
+    last = {delay: _last_samples(window.grid.offsets - delay, times, tolerance) for delay in set(late)}
+    before = np.column_stack([last[delay][0] for delay in late])
+    is_between = np.column_stack([last[delay][1] for delay in late])
+    rows = before, np.arange(len(late))
+    values, missing = window.values[rows], is_between | window.missing[rows]
+    for driven in twin.inputs:
+        column = window.signals.index(driven.name)
+        between = is_between[:, column]
+        if driven.hold == "foh" and between.any():
+            sampled = window.grid.offsets - late[column]
+            values[between, column] = np.interp(times[between], sampled, window.values[:, column])
+    error = _bridge_error(window, before, grid.steps[:, None])
+    start = window.start + float(times[0])
+    return replace(window, start=start, grid=grid, values=values, missing=missing, bridge_error=error)
+
+
+def _last_samples(sampled: Array, times: Array, tolerance: float) -> tuple[Indices, Mask]:
+    """Return which of the times ``sampled`` is the last up to each of ``times``, and whether the two differ."""
+    before = np.clip(np.searchsorted(sampled, times + tolerance, side="right") - 1, 0, len(sampled) - 1)
+    return before, np.abs(times - sampled[before]) > tolerance
 
 
 def _record_times(window: Window, delays: Collection[float], ends: tuple[float, float]) -> Array:
@@ -87,20 +93,20 @@ def _grid(times: Array, end: float, tolerance: float) -> TimeGrid:
     return TimeGrid.at(offsets, length)
 
 
-def _bridge_error(
-    window: Window, signal: str, before: "np.ndarray[tuple[int], np.dtype[np.intp]]", steps: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the error of a signal at the new records: the same noise lasts as long as before."""
-    old, error = window.grid.steps, window.bridge_error
+def _bridge_error(window: Window, before: Indices, steps: Array) -> BridgeError:
+    """Return the errors at the new records, whose ``steps`` are (records, 1): the same noise lasts as long as before.
+
+    ``before`` (records, signals) are the old records of their samples.
+    """
+    old, error, rows = window.grid.steps[:, None], window.bridge_error, (before, np.arange(before.shape[1]))
     if error is None:
-        none = np.zeros(len(steps))
-        return np.maximum(old[before], steps) / steps, none, none, none
-    column = window.signals.index(signal)
-    ratio, variance, held = (part[:, column] for part in (error.noise_ratio, error.variance, error.held_variance))
-    spacing = np.maximum((ratio * old)[before], steps)
-    duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > 0.0)[before]
-    change = error.expected_change[:, column][before]
-    return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps), change
+        none = np.zeros(before.shape)
+        return BridgeError(np.maximum(window.grid.steps[before], steps) / steps, none, none, none)
+    spacing, variance = np.maximum((error.noise_ratio * old)[rows], steps), error.variance[rows]
+    lasting = np.zeros(error.variance.shape)
+    np.divide(error.held_variance * old, error.variance, out=lasting, where=error.variance > 0.0)
+    held = variance * np.maximum(1.0, lasting[rows] / steps)
+    return BridgeError(spacing / steps, variance, held, error.expected_change[rows])
 
 
 def with_changes_between(window: Window, commands: Collection[str]) -> Window:

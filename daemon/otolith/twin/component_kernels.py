@@ -207,23 +207,46 @@ def adjoint(transition, input_now, input_next, output, feedthrough, gain, whiten
     return result
 '''
 
-# Each record goes to the few nearest points of a grid over the circle, with the weights of a Gaussian.
+# Each record goes to the few nearest points of a grid over the circle, with the weights of a Gaussian: a product of a
+# factor of the record, a factor of the point, and a power of a ratio, so that a record takes two exponentials.
 SPREAD = '''
 @njit(cache=True, error_model="numpy", fastmath=True)
 def spread(x, signals, first, width, points, variance, reach):
     """(records,), (records, signals) -> (points, signals): ``signals * exp(i first x)`` at the angles ``width * x``."""
     grid = np.zeros((points, signals.shape[1]), dtype=np.complex128)
     step = 2.0 * math.pi / points
+    weights = np.exp(-((step * np.arange(1 - reach, reach + 1)) ** 2) / (4.0 * variance))
     for record in range(len(x)):
         angle = width * x[record]
         nearest = math.floor(angle / step)
+        distance = nearest * step - angle
+        ratio = math.exp(-distance * step / (2.0 * variance))
+        factor = math.exp(-distance * (distance + 2.0 * (1 - reach) * step) / (4.0 * variance))
         phase = complex(math.cos(first * x[record]), math.sin(first * x[record]))
-        for point in range(nearest - reach + 1, nearest + reach + 1):
-            factor = phase * math.exp(-((point * step - angle) ** 2) / (4.0 * variance))
-            target = grid[point % points]
+        for index in range(2 * reach):
+            weight = phase * (factor * weights[index])
+            factor *= ratio
+            target = grid[(nearest + 1 - reach + index) % points]
             for signal in range(signals.shape[1]):
-                target[signal] += factor * signals[record, signal]
+                target[signal] += weight * signals[record, signal]
     return grid
+'''
+
+WHITEN = '''
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def whiten(whitening, slopes, present):
+    """(records, outputs, outputs), (records, outputs, columns) -> (records * outputs, columns): of the innovations."""
+    records, outputs, columns = slopes.shape
+    whitened = np.zeros((records * outputs, columns))
+    for record in range(records):
+        for row in range(outputs):
+            target = whitened[record * outputs + row]
+            for output in range(row + 1):
+                if present[record, output]:
+                    factor = whitening[record, row, output]
+                    for column in range(columns):
+                        target[column] += factor * slopes[record, output, column]
+    return -whitened
 '''
 
 CURVES = '''
@@ -252,9 +275,9 @@ def component_functions() -> list[str]:
 
 
 def kernels_of_all_twins() -> list[str]:
-    """``curves``, ``respond``, ``adjoint`` and ``spread``, with what they call."""
+    """``whiten``, ``curves``, ``respond``, ``adjoint`` and ``spread``, with what they call."""
     lines = component_functions()
-    for kernel in (CURVES, RESPOND, ADJOINT, SPREAD):
+    for kernel in (WHITEN, CURVES, RESPOND, ADJOINT, SPREAD):
         lines += [*kernel.strip().splitlines(), "", ""]
     return lines
 

@@ -33,7 +33,7 @@ many as with equal steps."""
 RELATIVE_TOLERANCE = 1e-11
 """Of the largest value of an output: truncation error that is allowed in any case, as rounding errors are near it."""
 
-SHARED = frozenset({"curves", "respond", "adjoint", "spread"})
+SHARED = frozenset({"whiten", "curves", "respond", "adjoint", "spread"})
 """Kernels that are the same for all twins: compiled once for all of them."""
 
 Indices = NDArray[np.int64]
@@ -87,10 +87,16 @@ class Excitation:
         return Excitation(self.inputs[part], grid, substeps, measured, gain)
 
 
-def _ordinary_step(grid: TimeGrid) -> float:
-    """The median step (s), but no small share of the mean one: samples may come in pairs."""
+def _step_ratio(grid: TimeGrid) -> int:
+    """How many times longer the longest step is than an ordinary one, as the next power of two.
+
+    An ordinary one is the median, but no small share of the mean one: samples may come in pairs.
+    """
+    if grid.period is not None or grid.records < 2:
+        return 1
     steps = grid.steps[:-1]
-    return max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
+    ordinary = max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
+    return 1 << int(np.ceil(np.log2(_longest(grid) / ordinary) - WHOLE))
 
 
 def _longest(grid: TimeGrid) -> float:
@@ -192,6 +198,11 @@ class Kernel:
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
         drive = (*excitation.arguments, excitation.grid.before_last, np.array(columns, dtype=np.int64))
         return Sensitivities(*self._call("sensitivities", parameters, initial, *drive))
+
+    def whiten(self, innovation: InnovationModel, slopes: Array, present: Mask) -> Array:
+        """(records * outputs, columns): the derivatives of the whitened innovations, from those of the prediction."""
+        derivatives: Array = self._call("whiten", innovation.whitening, slopes, present)
+        return derivatives
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
@@ -299,11 +310,9 @@ class Kernel:
         an ordinary step: the longest may have as many more as it is longer, so that the cost is linear in the records.
         """
         grid, count = excitation.grid, excitation.substeps
-        if grid.period is None and grid.records > 1:
-            limit *= 2 ** int(np.ceil(np.log2(_longest(grid) / _ordinary_step(grid)) - WHOLE))
         first, second = parameters[None], initial[None]
         coarse = self.simulate(first, second, excitation)
-        while count < limit:
+        while count < limit or count < limit * _step_ratio(grid):
             inputs, steps, counts, *correction = excitation.arguments
             fine = self._call("simulate", first, second, inputs, steps, 2 * counts, *correction)
             with np.errstate(invalid="ignore"):

@@ -241,12 +241,15 @@ def _forcing(code: KernelCode) -> Blocks:
 # The measurement update by the Cholesky factor of the innovation covariance and its inverse, both lower triangular.
 COVARIANCE_STEPS = '''
 @njit(error_model="numpy", $inner)
-def update_(covariance, output, innovation, present, gain, whitening):
-    """Fill gain and whitening, correct covariance; return the log determinant of the innovation covariance."""
+def update_(covariance, output, innovation, present, gain, whitening, cross, half):
+    """Fill gain and whitening, correct covariance; return the log determinant of the innovation covariance.
+
+    ``cross`` and ``half`` (states, outputs) are overwritten.
+    """
     outputs, states = output.shape
-    cross = np.zeros((states, outputs))
     for row in range(states):
         for column in range(outputs):
+            cross[row, column] = half[row, column] = 0.0
             for inner in range(states):
                 cross[row, column] += covariance[row, inner] * output[column, inner]
     for row in range(outputs):
@@ -274,7 +277,6 @@ def update_(covariance, output, innovation, present, gain, whitening):
             for inner in range(column, row):
                 rest -= innovation[row, inner] * whitening[inner, column]
             whitening[row, column] = rest / innovation[row, row]
-    half = np.zeros((states, outputs))
     for row in range(states):
         for column in range(outputs):
             for inner in range(column + 1):
@@ -291,12 +293,12 @@ def update_(covariance, output, innovation, present, gain, whitening):
 
 
 @njit(error_model="numpy", $inner)
-def propagate_(covariance, transition):
-    """Set covariance to transition @ covariance @ transition.T, exactly symmetric."""
+def propagate_(covariance, transition, product):
+    """Set covariance to transition @ covariance @ transition.T, exactly symmetric; ``product`` is overwritten."""
     states = len(covariance)
-    product = np.zeros((states, states))
     for row in range(states):
         for column in range(states):
+            product[row, column] = 0.0
             for inner in range(states):
                 product[row, column] += transition[row, inner] * covariance[inner, column]
     for row in range(states):
@@ -313,19 +315,22 @@ KALMAN = """
 def kalman(parameters, initial, inputs, steps, counts, parts, measured, sensor, process, noise, held_noise):
     records, log_determinant = inputs.shape[0], 0.0
     gain, whitening = np.zeros((records, $n_states, $n_outputs)), np.zeros((records, $n_outputs, $n_outputs))
-    covariance, transition = np.zeros(($n_states, $n_states)), np.zeros(($n_states, $n_states))
+    covariance, transition, product = np.zeros((3, $n_states, $n_states))
+    innovation = np.zeros(($n_outputs, $n_outputs))
+    cross, half = np.zeros((2, $n_states, $n_outputs))
     output, present = np.zeros(($n_outputs, $n_states)), np.zeros($n_outputs, dtype=np.bool_)
     $read_parameters
     for record in range(records):
         $read_inputs
         $linearised_y = linearise_outputs_($of_linearise_outputs_)
         $store_output_matrix
-        innovation = np.zeros(($n_outputs, $n_outputs))
+        innovation[:] = 0.0
         $sensor_noise
         $input_noise_in_outputs
         $innovations
         $mark_present
-        log_determinant += update_(covariance, output, innovation, present, gain[record], whitening[record])
+        filled = gain[record], whitening[record], cross, half
+        log_determinant += update_(covariance, output, innovation, present, *filled)
         $correct_state
         if record + 1 == records:
             break
@@ -337,7 +342,7 @@ def kalman(parameters, initial, inputs, steps, counts, parts, measured, sensor, 
             $read_inputs_of_part
             $next_state
             $store_transition
-            propagate_(covariance, transition)
+            propagate_(covariance, transition, product)
             $process_noise
             $advance_shifted
             $move_to_next
