@@ -449,10 +449,10 @@ def describe_sensors(problem: Problem) -> list[str]:
     """Return which sensors are noisier and which states more disturbed than stated, with the levels, one text each."""
     twin = problem.base_model
     units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
-    rows = [(f"{name} is noisier", units[name]) for name in twin.signals]
-    rows += [(f"{state.name} is disturbed more", f"{units[state.name]}/√s") for state in twin.states]
+    rows = [(f"{name} is noisier than stated", units[name]) for name in twin.signals]
+    rows += [(f"{state.name} is disturbed more than stated", f"{units[state.name]}/√s") for state in twin.states]
     return [
-        f"{what} than stated: {noise:.2g}{unit} instead of {stated:.2g}"
+        f"{what}: {noise:.2g}{unit} instead of {stated:.2g}"
         for (what, unit), noise, stated in zip(rows, problem.levels, problem.stated_levels, strict=True)
         if noise > stated
     ]

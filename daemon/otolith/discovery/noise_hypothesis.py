@@ -1,11 +1,11 @@
 """The hypothesis that signals are less certain than the problem states: sensors are noisier, commands change unseen.
 
-Levels of outputs, inputs and states are the most likely ones of a window. The hypothesis is compared by the full
-likelihood of the innovations, whose normalisation grows with the noise. So parameters or a component that explain a
-window up to the stated noise are better. Only innovations that are white with this noise count as noise.
+Levels of sensors, inputs, and of states where the machine file states some, are the most likely ones of a window. The
+hypothesis is compared by the full likelihood of the innovations, whose normalisation grows with the noise. So
+parameters or a component that explain a window up to the stated noise are better. Only innovations that are white with
+this noise count as noise.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import repeat
 from math import comb
@@ -17,7 +17,7 @@ from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypot
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
-from otolith.estimation.information import Prior, information, orthonormal_basis
+from otolith.estimation.information import Prior, information
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
@@ -28,9 +28,6 @@ MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
 VISIBLE = 1.0  # in -2 log likelihood: a step of the levels that gains less is the last one
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
-SMOOTH_MARGIN = 20.0  # in -2 log likelihood: by which noise of states must explain more than smooth errors of sensors
-SPREAD = 5.0  # standard deviations of χ² up to which it is as stated
-SMOOTH_LAGS = 16  # records: order up to which errors of a sensor follow each other
 ROUNDS = 2  # of fitting with the noise and estimating it again
 STEPS = 25  # of Gauss-Newton with the noise
 MAX_REPEATED = 0.1  # share of the samples that repeat the one before: with more, a converter hides the noise
@@ -41,37 +38,12 @@ MIN_SHRINKING = 0.04  # ratio of a variance after a step to that before
 RIDGE = 0.05  # added to the correlations of slopes, which few random vectors estimate
 
 
-def noisier_signals(fitted: Sequence[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Return the hypotheses of larger noise beside those ``fitted`` to a window, the null first; all leave white noise.
-
-    There is none where the best hypothesis leaves white noise as stated.
-    """
-    null, around = fitted[0], fitted[0].fit
-    best = min(fitted, key=lambda item: item.deviance(null.fit.count, 1.0)).fit
-    if is_white(best) and abs(best.window_chi_square - best.count) <= SPREAD * np.sqrt(2.0 * best.count):
-        return []
-    fits = _fitted(_likely(around.linearised_at_end()), null.fit)
+def noisier_signals(null: FittedHypothesis) -> list[FittedHypothesis]:
+    """Return the hypothesis of larger noise, fitted to the window of ``null``, if it leaves white noise."""
+    best = _at_larger_levels(null.fit, null.fit)
     for _ in range(ROUNDS if null.fit.cost > EXPLAINED else 0):  # far from the null, levels are those of its errors
-        best = min(fits, key=lambda item: item.chi_square + normalisation(item, null.fit), default=around)
-        around = replace(best, problem=null.problem)
-        fits = _fitted(_likely(around.linearised_at_end()), null.fit)
-    return [_hypothesis(item, null) for item in fits if is_white(item)]
-
-
-def _likely(before: Fit) -> list[Fit]:
-    """Return the window at likely levels where noise is stated, and elsewhere too."""
-    elsewhere = _at_likely_levels(before, allowed := _allowed(before))
-    if _is_smooth(before, elsewhere):
-        of_inputs = np.arange(len(allowed)) < len(before.problem.base_model.inputs)
-        elsewhere = _at_likely_levels(before, allowed & of_inputs)
-    return [_at_likely_levels(before, allowed & ~allowed), elsewhere]
-
-
-def _is_smooth(before: Fit, trial: Fit) -> bool:
-    """Whether noise of states that ``trial`` has beside that of ``before`` may be smooth errors of sensors."""
-    at = len(before.problem.base_model.signals)
-    is_new = np.array(trial.problem.levels[at:])[np.array(before.problem.levels[at:]) == 0.0].any()
-    return bool(is_new and _deviance(before) - _deviance(trial) <= _gain_of_smooth_errors(before) + SMOOTH_MARGIN)
+        best = _at_larger_levels(best or null.fit, null.fit)
+    return [_hypothesis(best, null)] if best is not None and is_white(best) else []
 
 
 def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
@@ -93,26 +65,28 @@ def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypoth
     return hypotheses
 
 
-def _fitted(trials: list[Fit], null: Fit) -> list[Fit]:
-    """Fit the window of ``null`` at the levels of each of the ``trials`` with larger ones, but no useless sensor."""
+def _at_larger_levels(around: Fit, null: Fit) -> Fit | None:
+    """Return the window of ``null`` fitted at likely levels around another fit; None if none is larger than stated.
+
+    A sensor that would be useless makes no hypothesis.
+    """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
-    distinct = {trial.problem.levels: trial for trial in trials if (np.array(trial.problem.levels) > stated).any()}
-    fits = [
-        fit(null.problem.with_levels(levels), null.window, _widened(null, trial), null.prior.mean, STEPS)
-        for levels, trial in distinct.items()
-    ]
-    return [item for item in fits if (np.array(item.problem.noise) <= useless).all()]
+    trial = _at_likely_levels(replace(around, problem=null.problem).linearised_at_end(), _inputs_without_noise(null))
+    if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
+        return None
+    return fit(trial.problem, null.window, _widened(null, trial), null.prior.mean, STEPS)
 
 
 def _widened(null: Fit, trial: Fit) -> Prior:
-    """Return the prior of ``null``, less certain by as much as a window is with the noise of ``trial``."""
+    """Return the prior of ``null``, where each parameter is less certain as that of a window is with more noise."""
     rows, free = len(null.prior.mean), len(null.problem.free)
     known, own = (
         information(jacobian[:-rows], np.ones(jacobian.shape[1]), 1.0).sd[:free]
         for jacobian in (null.result.first[2], trial.result.first[2])
     )
     ratios = np.divide(own, known, out=np.ones(free), where=np.isfinite(own) & np.isfinite(known))
-    return replace(null.prior, covariance=null.prior.covariance * max(float(median(ratios)), 1.0) ** 2)
+    scale = np.resize(np.maximum(ratios, 1.0), rows)  # trends follow the parameters
+    return replace(null.prior, covariance=null.prior.covariance * np.outer(scale, scale))
 
 
 def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
@@ -127,49 +101,30 @@ def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
 def _at_likely_levels(stated: Fit, allowed: Mask) -> Fit:
     """Return the window linearised at likely levels where noise is stated, and of further ``allowed`` places (levels,).
 
-    Each of these makes it more likely by one value. Inputs are kept rather than the states that they drive. A level
-    that is hardly larger stays, and so does a smaller one unless that is decisively less likely.
+    A level that is hardly another one stays as stated, and so does one without which the window is not decisively less
+    likely. Those of states are tried first: they follow nearly everything.
     """
-    before, places, added = np.array(stated.problem.levels), np.arange(len(allowed)), allowed
-    trial = _most_likely(stated, (before > 0.0) | added)
-    for at in np.flatnonzero(allowed)[::-1]:
-        without = added & (places != at)
-        fewer = _at(trial, np.where(places == at, 0.0, trial.problem.levels))
-        fewer = _most_likely(fewer, (before > 0.0) | without)
-        if _deviance(fewer) <= _deviance(trial) + np.log(stated.count):
-            added, trial = without, fewer
-    ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, np.inf)
-    larger = added | (ratios > MIN_NOISE_FACTOR)
-    for kept in (larger, larger | ((before > 0.0) & (ratios < 1.0 / MIN_NOISE_FACTOR))):
-        again = _most_likely(_at(trial, np.where(kept, trial.problem.levels, before)), kept)
-        if _deviance(again) <= _deviance(trial) + DECISIVE:
-            break
-    return again
+    before, places = np.array(stated.problem.levels), np.arange(len(allowed))
+    trial = _most_likely(stated, (before > 0.0) | allowed)
+    ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, 1.0)
+    kept = allowed | ((before > 0.0) & ((ratios > MIN_NOISE_FACTOR) | (ratios < 1.0 / MIN_NOISE_FACTOR)))
+    trial = _with_levels_of(trial, stated, kept)
+    for at in np.flatnonzero(kept)[::-1]:
+        fewer = _with_levels_of(trial, stated, kept & (places != at))
+        if _deviance(fewer) <= _deviance(trial) + DECISIVE:
+            kept, trial = kept & (places != at), fewer
+    return trial
 
 
-def _gain_of_smooth_errors(fitted: Fit) -> float:
-    """Return by what -2 log likelihood would fall with autoregressive errors of the outputs, less two for a value."""
-    _, residuals, jacobian = fitted.result.first
-    basis, present, total = orthonormal_basis(jacobian), fitted.objective.present, 0.0
-    left = (residuals - basis @ (basis.T @ residuals))[: present.size].reshape(present.shape)
-    for series, measured in zip(left.T, present.T, strict=True):
-        values = series[measured]
-        count, power, order = len(values), float(values @ values), min(SMOOTH_LAGS, len(values) // 4)
-        covariances = np.array([values[lag:] @ values[: count - lag] for lag in range(order + 1)]) / max(count, 1)
-        near = covariances[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
-        variance = covariances[0] - covariances[1:] @ np.linalg.lstsq(near, covariances[1:], rcond=None)[0]
-        if variance > 0.0:
-            total += max(power - count * (1.0 + np.log(variance)) - 2.0 * (order + 1), 0.0)
-    return total
+def _with_levels_of(trial: Fit, stated: Fit, places: Mask) -> Fit:
+    """Return the window at the most likely levels of ``places`` (levels,), searched from ``trial``, else as stated."""
+    return _most_likely(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
 
 
-def _allowed(stated: Fit) -> Mask:
-    """Return where no noise is stated but may be (levels,): inputs that show some, states that are no mere sums."""
-    twin = stated.problem.base_model
-    equations, names = dict(twin.equations), [state.name for state in twin.states]
-    of_states = [equations[f"der({name})"].strip() not in names for name in names]
-    free = (np.array(stated.problem.levels) == 0.0) & (_limits(stated)[1] > 0.0)
-    return np.asarray(free & np.array([True] * len(twin.signals) + of_states))
+def _inputs_without_noise(stated: Fit) -> Mask:
+    """Return which levels (levels,) are those of inputs that show noise where none is stated."""
+    levels, highest = np.array(stated.problem.levels), _limits(stated)[1]
+    return np.asarray((levels == 0.0) & (highest > 0.0) & np.isfinite(highest))
 
 
 def _most_likely(trial: Fit, places: Mask) -> Fit:

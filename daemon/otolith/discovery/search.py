@@ -166,7 +166,7 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     gains = screening.response.score_delays().gain
     fitted += [*changing_commands(fitted[0], gains), *late_signals(fitted[0], gains)]
-    return fitted + noisier_signals(fitted)
+    return fitted + noisier_signals(fitted[0])
 
 
 def _errors_of_encoders(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
