@@ -133,19 +133,20 @@ MISSTATED_SEEDS = (1, 2, *(pytest.param(seed, marks=pytest.mark.full) for seed i
 
 @pytest.mark.parametrize("seed", MISSTATED_SEEDS)
 @pytest.mark.parametrize(
-    ("plant", "free", "noise", "process", "sensors"),
+    ("plant", "free", "noise", "factors"),
     [
-        (SERVO_AXIS, (), AXIS_NOISE, 0.1, 0.3),
-        (SERVO_AXIS, (), AXIS_NOISE, 0.1, 10.0),
-        (SERVO_AXIS, (), AXIS_NOISE, 10.0, 0.1),
-        (DC_MOTOR, ("R_a", "D"), MOTOR_NOISE, 0.1, 0.3),
+        (SERVO_AXIS, (), AXIS_NOISE, (0.1, 0.3)),
+        (SERVO_AXIS, (), AXIS_NOISE, (0.1, 10.0)),
+        (SERVO_AXIS, (), AXIS_NOISE, (10.0, 0.1)),
+        (DC_MOTOR, ("R_a", "D"), MOTOR_NOISE, (0.1, 0.3)),
     ],
     ids=("axis, less of both", "axis, less process", "axis, more process", "motor, less of both"),
 )
 def test_process_and_sensor_noise_misstated_together_are_named(
-    plant: Plant, free: tuple[str, ...], noise: Mapping[str, float], process: float, sensors: float, seed: int
+    plant: Plant, free: tuple[str, ...], noise: Mapping[str, float], factors: tuple[float, float], seed: int
 ) -> None:
     """Both are stated as a multiple of what they are."""
+    process, sensors = factors
     case = Case("misstated", disturbed(plant, noise), HEALTHY, free, healthy=8, changed=0)
     true, states = case.problem, [state.name for state in case.problem.twin.states]
     stated = tuple(process * noise.get(name, 0.0) for name in states)
