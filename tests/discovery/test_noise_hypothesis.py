@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.changes.healthy import MACHINES, cases
-from benchmarks.changes.machines import SERVO_AXIS_DIRECTIONAL
+from benchmarks.changes.machines import DC_MOTOR, SERVO_AXIS, SERVO_AXIS_DIRECTIONAL
 from benchmarks.changes.observe import Case, recordings
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Values
 from benchmarks.discovery.motor import Faults
@@ -15,6 +15,7 @@ from benchmarks.discovery.motor import Faults
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
+from otolith.discovery.hypotheses import describe_noise
 from otolith.health.schema import Status
 from tests.discovery.test_search import initial, run, simulated
 
@@ -124,6 +125,67 @@ def test_process_noise_that_is_stated_too_large_is_no_faulty_sensor(factor: floa
         assert parameter.low is not None
         assert parameter.high is not None
         assert parameter.low <= truth[name] <= parameter.high
+
+
+AXIS_NOISE, MOTOR_NOISE = {"v": 1e-3}, {"i": 0.05, "omega": 0.3}
+MISSTATED_SEEDS = (1, 2, *(pytest.param(seed, marks=pytest.mark.full) for seed in (3, 4, 5)))
+
+
+@pytest.mark.parametrize("seed", MISSTATED_SEEDS)
+@pytest.mark.parametrize(
+    ("plant", "free", "noise", "factors"),
+    [
+        (SERVO_AXIS, (), AXIS_NOISE, (0.1, 0.3)),
+        (SERVO_AXIS, (), AXIS_NOISE, (0.1, 10.0)),
+        (SERVO_AXIS, (), AXIS_NOISE, (10.0, 0.1)),
+        (DC_MOTOR, ("R_a", "D"), MOTOR_NOISE, (0.1, 0.3)),
+    ],
+    ids=("axis, less of both", "axis, less process", "axis, more process", "motor, less of both"),
+)
+def test_process_and_sensor_noise_misstated_together_are_named(
+    plant: Plant, free: tuple[str, ...], noise: Mapping[str, float], factors: tuple[float, float], seed: int
+) -> None:
+    """Both are stated as a multiple of what they are."""
+    process, sensors = factors
+    case = Case("misstated", disturbed(plant, noise), HEALTHY, free, healthy=8, changed=0)
+    true, states = case.problem, [state.name for state in case.problem.twin.states]
+    stated = tuple(process * noise.get(name, 0.0) for name in states)
+    problem = replace(true, noise=tuple(sensors * level for level in true.noise), process_noise=stated)
+    (windows,) = recordings(case, true, [0], seed=seed)
+    state, documents = run(initial_state(plant.twin, "test", problem), windows)
+    decisions = [document.decision for document in documents]
+    assert set(decisions) <= WHITE
+    assert WindowDecision.NOISIER in decisions[:4]
+    assert set(decisions[4:]) == {WindowDecision.LEARNED}
+    assert state.problem.process_noise == pytest.approx([noise.get(name, 0.0) for name in states], rel=0.4)
+    for name, parameter in documents[-1].parameters.items():
+        assert parameter.value == pytest.approx(plant.parameters[name], abs=4.0 * (parameter.sd or 0.0))
+
+
+def test_an_error_that_repeats_with_the_speed_is_no_process_noise() -> None:
+    def warp(_: np.random.Generator, __: Plant, signals: dict[str, Array]) -> None:
+        signals["omega"] += np.sin(4.0 * signals["omega"])
+
+    case = Case("warped", disturbed(DC_MOTOR, MOTOR_NOISE), HEALTHY, ("R_a", "D"), healthy=0, changed=5, disturb=warp)
+    problem = replace(case.problem, process_noise=tuple(MOTOR_NOISE.values()))
+    (windows,) = recordings(case, problem, [0], seed=1)
+    state, documents = run(initial_state("motor", "test", problem), windows)
+    assert state.problem.levels == problem.levels
+    assert all(document.decision is not WindowDecision.NOISIER for document in documents)
+
+
+def test_noise_of_a_state_is_no_hypothesis_where_none_is_stated() -> None:
+    case = Case("unstated", disturbed(DC_MOTOR, MOTOR_NOISE), HEALTHY, ("R_a", "D"), healthy=4, changed=0)
+    (windows,) = recordings(case, case.problem, [0], seed=1)
+    state, documents = run(initial_state("motor", "test", case.problem), windows)
+    assert not any(state.problem.process_noise)
+    assert not any(document.components for document in documents)
+
+
+def test_the_text_names_state_and_level() -> None:
+    problem = initial("R_a", "D").problem
+    text = describe_noise(problem.with_levels((*problem.levels[:4], 0.05, 0.0)))
+    assert text == "i is disturbed more than stated: 0.05 A/√s instead of 0"
 
 
 @pytest.mark.full

@@ -15,7 +15,6 @@ it. The second one contains a window that the first one has not seen. ``docs/exp
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from otolith.discovery.linear_response import (
     ScoreStatistics,
     basis_functions,
 )
-from otolith.discovery.noise_hypothesis import likelier_levels
+from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
 from otolith.estimation.information import initial_prior, orthonormal_basis
 from otolith.estimation.objective import EXPLAINED
@@ -426,9 +425,8 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     Noise that was stated larger than it is hides structure, so likelier levels are searched at. But what the
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
-    response_at = cache(lambda levels: _pooled(levels, windows))
-    quieter = likelier_levels(problem, lambda levels: _deviance(response_at(levels)))
-    pooled = response_at(quieter)
+    quieter = likelier_levels_of(_fits(problem, windows)[-1])
+    pooled = _pooled(quieter, windows)
     at_positions = positions(problem.base_model)
     forms = [form for form in pooled_forms(pooled) if form.source in at_positions]
     for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):
@@ -446,15 +444,14 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
 
 
 def _pooled(problem: Problem, windows: Starts) -> PooledResponse:
-    """Return the response of the windows, each linearised at what was known of the parameters after it."""
+    return PooledResponse(_fits(problem, windows))
+
+
+def _fits(problem: Problem, windows: Starts) -> list[Fit]:
+    """Return the windows, each linearised at what was known of the parameters after it."""
     prior, trends = initial_prior(problem), np.zeros(len(problem.free))
     starts = ((window, state, np.concatenate([parameters, trends])) for window, state, parameters in windows)
-    return PooledResponse([fit(problem, window, prior, start, 0, state=state) for window, state, start in starts])
-
-
-def _deviance(pooled: PooledResponse) -> float:
-    """Minus twice the log-likelihood of the process noise, up to a constant."""
-    return pooled.chi_square + sum(part.objective.innovation_model.log_determinant for part in pooled.parts)
+    return [fit(problem, window, prior, start, 0, state=state) for window, state, start in starts]
 
 
 def _key(pooled: PooledResponse, form: CandidateForm) -> str:

@@ -448,12 +448,14 @@ def describe_noise(problem: Problem) -> str:
 
 
 def describe_sensors(problem: Problem) -> list[str]:
-    """Return which sensors are noisier than stated, with their noise, one text each."""
+    """Return which sensors are noisier and which states more disturbed than stated, with the levels, one text each."""
     twin = problem.base_model
     units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
+    rows = [(f"{name} is noisier than stated", units[name]) for name in twin.signals]
+    rows += [(f"{state.name} is disturbed more than stated", f"{units[state.name]}/√s") for state in twin.states]
     return [
-        f"{name} is noisier than stated: {noise:.2g}{units[name]} instead of {stated:.2g}"
-        for name, noise, stated in zip(twin.signals, problem.levels, problem.stated_levels, strict=True)
+        f"{what}: {noise:.2g}{unit} instead of {stated:.2g}"
+        for (what, unit), noise, stated in zip(rows, problem.levels, problem.stated_levels, strict=True)
         if noise > stated
     ]
 

@@ -21,7 +21,7 @@ from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
 from otolith.estimation.window_fit import Fit
-from otolith.twin.components import augmented_model, family_code, sources
+from otolith.twin.components import augmented_model, family_code, sensor_site, sites, sources
 from otolith.twin.kernel import Indices, LinearisedModel, kernel_of
 
 MAX_DIFFERENCE = 10.0  # of χ²: less than that, and a window does not distinguish a component from a parameter
@@ -246,13 +246,31 @@ class LinearResponse(ProjectedResponse):
         The first is with the remainder. The others are with random vectors after projection, whose covariance is the
         projector: their mean square is the squared length of the projected response.
         """
+        return self._adjoint(self._linear)
+
+    def _adjoint(self, linear: LinearisedModel) -> Array:
         rows = len(self._basis) + len(self._prior_basis)
         vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, rows)
         shared = self._basis.T @ vectors[: len(self._basis)] + self._prior_basis.T @ vectors[len(self._basis) :]
         probes = vectors[: len(self._basis)] - self._basis @ shared
         signals = np.column_stack([self._remainder, probes])
-        model, present = self.objective.innovation_model, self.objective.present
-        return self._kernel.adjoint(self._linear, model, present, signals)
+        return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, signals)
+
+    def squares_of_noise(self) -> Array:
+        """(signals + states, 1 + PROBES) of squares: of the inner product with white noise of level one at each place.
+
+        Places are those of :attr:`Problem.levels`. The first column is that of the remainder, the others are of probes:
+        if the noise is as stated, all are distributed alike.
+        """
+        twin, linear = self.problem.base_model, self._linear
+        names, of_sites = [site.name for site in sites(twin)], (self._adjoint_signals**2).sum(axis=0)
+        of_signals = of_sites[[names.index(sensor_site(signal)) for signal in twin.signals]]
+        records, size, count = len(linear.transition), linear.transition.shape[1], len(twin.states)
+        each = np.ascontiguousarray(np.broadcast_to(np.eye(size, count), (records, size, count)))
+        nothing = np.zeros((records, len(twin.outputs), count))
+        disturbed = linear._replace(input_now=each, input_next=np.zeros(each.shape), feedthrough=nothing)
+        of_states = self._adjoint(disturbed) ** 2
+        return np.concatenate([of_signals, np.tensordot(self.window.grid.steps, of_states, axes=(0, 0))])
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""

@@ -1,47 +1,49 @@
 """The hypothesis that signals are less certain than the problem states: sensors are noisier, commands change unseen.
 
-Each output has its own factor on the standard deviation of its noise: the root mean square of its whitened innovations.
-The noise of an input colours the innovations. It is at most what its signal shows from sample to sample, and the most
-likely level up to there. The hypothesis is compared by the full likelihood of the innovations, whose normalisation
-grows with the noise. So parameters or a component that explain a window up to the stated noise are better. Only
-innovations that are white with this noise count as noise: what follows a curve is no noise, however large.
+Levels of sensors, inputs, and of states where the machine file states some, are the most likely ones of a window. The
+hypothesis is compared by the full likelihood of the innovations, whose normalisation grows with the noise. So
+parameters or a component that explain a window up to the stated noise are better. Only innovations that are white with
+this noise count as noise.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
+from itertools import repeat
+from math import comb
 
 import numpy as np
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis
-from otolith.discovery.linear_response import chi_square_of_parameters
-from otolith.discovery.screening import DECISIVE, linearised
+from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
+from otolith.estimation.information import Prior, information
+from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
 
 # Thresholds: docs/reference/thresholds-discovery.md has the origin of each.
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
 MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
-INPUT_SHARES = 0.5 ** (0.5 * np.arange(7.0))  # of what an input shows from sample to sample: its noise
-LESS_NOISE = 0.5  # ratio of two levels of noise that are compared
-VISIBLE = 1.0  # in -2 log likelihood: an input's noise that changes the normalisation by less does not show
+VISIBLE = 1.0  # in -2 log likelihood: a step of the levels that gains less is the last one
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
-ROUNDS = 4  # of fitting with the noise and estimating it
-STEPS = 25  # of Gauss-Newton in each
+ROUNDS = 2  # of fitting with the noise and estimating it again
+STEPS = 25  # of Gauss-Newton with the noise
+MAX_REPEATED = 0.1  # share of the samples that repeat the one before: with more, a converter hides the noise
+LEAST_SHARE = 0.05  # of a stated level: the least one that a window can show
+MAX_SCORING = 10  # steps of Fisher scoring
+LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of a step that are tried
+MIN_SHRINKING = 0.04  # ratio of a variance after a step to that before
+RIDGE = 0.05  # added to the correlations of slopes, which few random vectors estimate
 
 
-def noisier_sensors(null: FittedHypothesis) -> list[FittedHypothesis]:
-    """Return the hypotheses that sensors are noisier, fitted to the window of ``null``: outputs alone, or inputs too.
-
-    The innovations of a sensor that is not noisier must be as large as stated, and all must be white.
-    """
-    problems = [null.problem]
-    if (noisier := _with_noisier_inputs(null.fit)).levels != null.problem.levels:
-        problems.append(noisier)
-    fitted = (_fitted(problem, null) for problem in problems)
-    return [item for item in fitted if item is not None]
+def noisier_signals(null: FittedHypothesis) -> list[FittedHypothesis]:
+    """Return the hypothesis of larger noise, fitted to the window of ``null``, if it leaves white noise."""
+    best = _at_larger_levels(null.fit, null.fit)
+    for _ in range(ROUNDS if null.fit.cost > EXPLAINED else 0):  # far from the null, levels are those of its errors
+        best = _at_larger_levels(best or null.fit, null.fit)
+    return [_hypothesis(best, null)] if best is not None and is_white(best) else []
 
 
 def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
@@ -63,50 +65,114 @@ def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypoth
     return hypotheses
 
 
-def _fitted(problem: Problem, null: FittedHypothesis) -> FittedHypothesis | None:
-    """Return the hypothesis of the levels of ``problem``, with those of the outputs fitted; None if it has none."""
-    before, known = null.problem.levels, null.fit
-    if problem.levels != before:
-        known = fit(problem, known.window, known.prior, known.prior.mean, STEPS)
-    best = known
-    factors = np.ones(len(problem.noise))
-    for _ in range(ROUNDS):
-        factors *= _noise_ratios(best)
-        factors = np.where(factors < MIN_NOISE_FACTOR, 1.0, factors)
-        if (factors > MAX_NOISE_FACTOR).any():
-            return None
-        if (factors == 1.0).all():
-            best = known
-            break
-        inputs = problem.levels[: -len(factors)]
-        scaled = problem.with_levels((*inputs, *(np.array(problem.noise) * factors).tolist()))
-        best = fit(scaled, best.window, best.prior, best.prior.mean, STEPS)
-    signals = problem.base_model.signals
-    rows = zip(signals, best.problem.levels, before, strict=True)
-    noisy = [name for name, level, other in rows if level > other]
-    if not noisy or not is_white(best):
+def _at_larger_levels(around: Fit, null: Fit) -> Fit | None:
+    """Return the window of ``null`` fitted at likely levels around another fit; None if none is larger than stated.
+
+    A sensor that would be useless makes no hypothesis.
+    """
+    stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
+    trial = _at_likely_levels(replace(around, problem=null.problem).linearised_at_end(), _inputs_without_noise(null))
+    if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
         return None
-    stated = FaultHypothesis(FaultType.NOISE, ", ".join(noisy), len(noisy), 2.0 ** len(signals) - 1.0)
-    return FittedHypothesis(stated, best, normalisation(best, null.fit))
+    return fit(trial.problem, null.window, _widened(null, trial), null.prior.mean, STEPS)
 
 
-def _with_noisier_inputs(null: Fit) -> Problem:
-    """Return the problem with the most likely noise of each input, if its gain exceeds the penalty of one value."""
-    best, least = null.problem, _deviance(linearised(null.problem, null.window, null.prior, null.parameters))
-    unseen = null.objective.innovation_model.log_determinant + VISIBLE
-    for at, source in enumerate(best.base_model.inputs):
-        differences, levels = np.abs(sample_differences(source.name, null.window)), best.levels
-        shown = MAD_TO_SD * median(differences) if len(differences) else 0.0
-        shares = shown * INPUT_SHARES
-        for level in shares[shares > MIN_NOISE_FACTOR * levels[at]].tolist():
-            problem = null.problem.with_levels((*levels[:at], level, *levels[at + 1 :]))
-            trial = linearised(problem, null.window, null.prior, null.parameters)
-            if trial.objective.innovation_model.log_determinant <= unseen:
-                break
-            penalty = np.log(null.count) if best.levels[at] == levels[at] else 0.0
-            if (deviance := _deviance(trial)) + penalty < least:
-                best, least = problem, deviance
-    return best
+def _widened(null: Fit, trial: Fit) -> Prior:
+    """Return the prior of ``null``, where each parameter is less certain as that of a window is with more noise."""
+    rows, free = len(null.prior.mean), len(null.problem.free)
+    known, own = (
+        information(jacobian[:-rows], np.ones(jacobian.shape[1]), 1.0).sd[:free]
+        for jacobian in (null.result.first[2], trial.result.first[2])
+    )
+    ratios = np.divide(own, known, out=np.ones(free), where=np.isfinite(own) & np.isfinite(known))
+    scale = np.resize(np.maximum(ratios, 1.0), rows)  # trends follow the parameters
+    return replace(null.prior, covariance=null.prior.covariance * np.outer(scale, scale))
+
+
+def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
+    """Return the hypothesis of the levels of ``fitted``."""
+    twin, before, levels = fitted.problem.base_model, np.array(null.problem.levels), np.array(fitted.problem.levels)
+    names = np.array([*twin.signals, *(f"der({state.name})" for state in twin.states)])
+    changed = int((levels != before).sum())
+    stated = FaultHypothesis(FaultType.NOISE, ", ".join(names[levels > before]), changed, comb(len(names), changed))
+    return FittedHypothesis(stated, fitted, normalisation(fitted, null.fit))
+
+
+def _at_likely_levels(stated: Fit, allowed: Mask) -> Fit:
+    """Return the window linearised at likely levels where noise is stated, and of further ``allowed`` places (levels,).
+
+    A level that is hardly another one stays as stated, and so does one without which the window is not decisively less
+    likely. Those of states are tried first: they follow nearly everything.
+    """
+    before, places = np.array(stated.problem.levels), np.arange(len(allowed))
+    trial = _most_likely(stated, (before > 0.0) | allowed)
+    ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, 1.0)
+    kept = allowed | ((before > 0.0) & ((ratios > MIN_NOISE_FACTOR) | (ratios < 1.0 / MIN_NOISE_FACTOR)))
+    trial = _with_levels_of(trial, stated, kept)
+    for at in np.flatnonzero(kept)[::-1]:
+        fewer = _with_levels_of(trial, stated, kept & (places != at))
+        if _deviance(fewer) <= _deviance(trial) + DECISIVE:
+            kept, trial = kept & (places != at), fewer
+    return trial
+
+
+def _with_levels_of(trial: Fit, stated: Fit, places: Mask) -> Fit:
+    """Return the window at the most likely levels of ``places`` (levels,), searched from ``trial``, else as stated."""
+    return _most_likely(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
+
+
+def _inputs_without_noise(stated: Fit) -> Mask:
+    """Return which levels (levels,) are those of inputs that show noise where none is stated."""
+    levels, highest = np.array(stated.problem.levels), _limits(stated)[1]
+    return np.asarray((levels == 0.0) & (highest > 0.0) & np.isfinite(highest))
+
+
+def _most_likely(trial: Fit, places: Mask) -> Fit:
+    """Return the window linearised at the levels of ``places`` (levels,) that maximise the likelihood.
+
+    Fisher scoring over variances (N. K. Gupta, R. K. Mehra, IEEE Transactions on Automatic Control 19, 1974). Slope and
+    expected curvature are mean and covariance of the squared inner products with random vectors.
+    """
+    lowest, highest = _limits(trial)
+    for _ in range(MAX_SCORING if places.any() else 0):
+        variances, squares = np.array(trial.problem.levels) ** 2, LinearResponse(trial).squares_of_noise()
+        slope, covariance = squares[:, 0] - squares[:, 1:].mean(axis=1), np.cov(squares[:, 1:]) / 2.0
+        scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+        correlation, free = covariance / np.outer(scale, scale) + RIDGE * np.eye(len(scale)), places
+        for _ in range(2):  # a level that would fall below its limit stays
+            inverse = np.linalg.pinv(np.where(np.outer(free, free), correlation, 0.0))
+            step = inverse @ (slope / scale) / scale
+            free = places & ((variances > lowest**2) | (step > 0.0))
+        if 0.5 * float(slope @ step) < VISIBLE:
+            break
+        bounds = np.maximum(lowest**2, MIN_SHRINKING * variances), highest**2
+        moved = (np.clip(variances + share * step, *bounds) for share in LENGTHS)
+        trials = (_at(trial, np.sqrt(np.where(places, own, variances))) for own in moved)
+        better = next((own for own in trials if _deviance(own) < _deviance(trial)), None)
+        if better is None:
+            break
+        trial = better
+    return trial
+
+
+def _limits(trial: Fit) -> tuple[Array, Array]:
+    """Return the least level of each place, which a converter raises, and the largest that samples of an input show."""
+    problem, stated = trial.problem, np.array(trial.problem.stated_levels)
+    lowest, inputs = LEAST_SHARE * stated, len(problem.base_model.inputs)
+    for at, (output, step) in enumerate(
+        zip(problem.base_model.outputs, problem.steps or repeat(0.0), strict=False), inputs
+    ):
+        is_coarse = (np.diff(trial.window.readings(output.name)) == 0.0).mean() > MAX_REPEATED
+        lowest[at] = stated[at] if is_coarse else max(lowest[at], min(step, stated[at]))
+    highest = np.full(len(stated), np.inf)
+    for at, source in enumerate(problem.base_model.inputs):
+        differences = np.abs(sample_differences(source.name, trial.window))
+        highest[at] = max(MAD_TO_SD * median(differences) if len(differences) else 0.0, stated[at])
+    return lowest, highest
+
+
+def _at(trial: Fit, levels: Array) -> Fit:
+    return replace(trial, problem=trial.problem.with_levels(levels.tolist())).linearised_at_end()
 
 
 def _deviance(trial: Fit) -> float:
@@ -114,29 +180,14 @@ def _deviance(trial: Fit) -> float:
     return chi_square_of_parameters(trial) + trial.objective.innovation_model.log_determinant
 
 
-def likelier_levels(problem: Problem, deviance: Callable[[Problem], float]) -> Problem:
-    """Return the problem with the noise of states, or of outputs, halved as often as its ``deviance`` falls decisively.
+def likelier_levels_of(fitted: Fit) -> Problem:
+    """Return the problem of ``fitted`` with the likely levels of its window if all are smaller, else with its own.
 
     Process noise that is stated too large for that of the sensors makes the predictor follow every sample. The gain of
     a sensor would change how far it follows, and would pass for a cause.
     """
-    least = deviance(problem)
-    while any(problem.process_noise):
-        states, outputs = (tuple(LESS_NOISE * level for level in own) for own in (problem.process_noise, problem.noise))
-        inputs = problem.levels[: -len(outputs)]
-        lower = replace(problem, process_noise=states), problem.with_levels((*inputs, *outputs))
-        deviances = list(map(deviance, lower))
-        if min(deviances) >= least - DECISIVE:
-            break
-        least = min(deviances)
-        problem = lower[deviances.index(least)]
-    return problem
-
-
-def likelier_levels_of(fitted: Fit) -> Problem:
-    """Return the problem of ``fitted`` with the :func:`likelier_levels` of its window, linearised at its parameters."""
-    window, prior, start = fitted.window, fitted.prior, fitted.parameters
-    return likelier_levels(fitted.problem, lambda problem: _deviance(linearised(problem, window, prior, start)))
+    likely = _at_likely_levels(fitted.linearised_at_end(), np.zeros(len(fitted.problem.levels), dtype=np.bool_)).problem
+    return likely if (np.array(likely.levels) <= fitted.problem.levels).all() else fitted.problem
 
 
 def normalisation(fitted: Fit, reference: Fit) -> float:
@@ -160,10 +211,3 @@ def is_white(fitted: Fit) -> bool:
             if abs(float(values[lag:] @ values[:-lag])) > WHITE_DEVIATIONS * max(power, count) / np.sqrt(count):
                 return False
     return True
-
-
-def _noise_ratios(fitted: Fit) -> Array:
-    """Return the root mean square (outputs,) of the whitened innovations."""
-    present = fitted.objective.present
-    squares = np.where(present, fitted.innovations**2, 0.0).sum(axis=0)
-    return np.asarray(np.sqrt(squares / np.maximum(present.sum(axis=0), 1)))

@@ -33,7 +33,7 @@ from otolith.discovery.hypotheses import (
     with_components,
 )
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
-from otolith.discovery.noise_hypothesis import changing_commands, noisier_sensors
+from otolith.discovery.noise_hypothesis import changing_commands, noisier_signals
 from otolith.discovery.screening import (
     DECISIVE,
     CompetingForms,
@@ -165,8 +165,8 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     gains = screening.response.score_delays().gain
-    uncertain = [*noisier_sensors(fitted[0]), *changing_commands(fitted[0], gains)]
-    return [*fitted, *uncertain, *late_signals(fitted[0], gains)]
+    fitted += [*changing_commands(fitted[0], gains), *late_signals(fitted[0], gains)]
+    return fitted + noisier_signals(fitted[0])
 
 
 def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:

@@ -106,7 +106,7 @@ class Problem:
     free: tuple[Parameter, ...]  # Parameters to estimate, with the nominal values and bounds of this machine
     noise: tuple[float, ...]  # Standard deviation of the sensor of each output
     stated_noise: tuple[float, ...] = ()
-    """:attr:`levels` as the machine file states them, where windows have shown that one is larger; empty otherwise."""
+    """:attr:`levels` as the machine file states them, where windows have shown others; empty otherwise."""
     steps: tuple[float, ...] = ()
     """Step of the converter of each output, as the windows have shown it; 0 or empty for none."""
     input_noise: tuple[float, ...] = ()  # Standard deviation of each input; empty for none
@@ -148,8 +148,10 @@ class Problem:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Standard deviation of each input, then of the sensor of each output: in the order of the twin's signals."""
-        return (*(self.input_noise or (0.0,) * len(self.base_model.inputs)), *self.noise)
+        """Noise of each input, then of each output, in the order of the twin's signals; then process noise."""
+        twin = self.base_model
+        inputs, states = self.input_noise or (0.0,) * len(twin.inputs), self.process_noise or (0.0,) * len(twin.states)
+        return (*inputs, *self.noise, *states)
 
     @property
     def stated_levels(self) -> tuple[float, ...]:
@@ -158,11 +160,14 @@ class Problem:
 
     def with_levels(self, levels: Sequence[float]) -> "Problem":
         """Return the problem with other :attr:`levels`."""
-        count = len(self.base_model.inputs)
-        inputs, outputs = tuple(levels[:count]), tuple(levels[count:])
-        stated = () if (*inputs, *outputs) == self.stated_levels else self.stated_levels
+        inputs, outputs = len(self.base_model.inputs), len(self.noise)
+        before, own, after = levels[:inputs], levels[inputs : inputs + outputs], levels[inputs + outputs :]
         return replace(
-            self, noise=outputs, input_noise=inputs if self.input_noise or any(inputs) else (), stated_noise=stated
+            self,
+            noise=tuple(own),
+            input_noise=tuple(before) if self.input_noise or any(before) else (),
+            process_noise=tuple(after) if self.process_noise or any(after) else (),
+            stated_noise=() if tuple(levels) == self.stated_levels else self.stated_levels,
         )
 
 

@@ -139,7 +139,8 @@ class Decoder:
         twin = self._twin
         if isinstance(value, Problem):
             noise = (value.stated_noise, value.steps, value.input_noise, value.process_noise)
-            sizes = zip(noise, (twin.signals, twin.outputs, twin.inputs, twin.states), strict=True)
+            levels = (*twin.signals, *twin.states)
+            sizes = zip(noise, (levels, twin.outputs, twin.inputs, twin.states), strict=True)
             return len(value.noise) == len(twin.outputs) and all(len(a) in (0, len(b)) for a, b in sizes)
         if isinstance(value, Window):
             shape, error = (value.grid.records, len(twin.signals)), value.bridge_error

@@ -60,7 +60,7 @@ class FilterRecord(StrictModel):
     variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
     phase: PhaseAdvance | None
     noise: tuple[float, ...]
-    """Of the inputs, which older files lack, then of the outputs; empty unless accepted as larger than stated."""
+    """Of inputs and states, which older files lack, around that of outputs; empty unless accepted as not as stated."""
     steps: tuple[float, ...] = ()  # See otolith.estimation.problem.Problem.steps
     changing: tuple[str, ...] = ()  # See otolith.estimation.problem.Problem.changing
     shifts: tuple[tuple[float, ...], ...] = ()  # See ParameterCusum.sums; empty for none
@@ -241,13 +241,13 @@ def _with_noise(problem: Problem, noise: tuple[float, ...]) -> Problem:
     """Return the problem with the ``noise`` that was accepted; empty for that of the machine file."""
     if not noise:
         return problem
-    stated, outputs = problem.levels, len(problem.noise)
-    noise = (*stated[:-outputs], *noise) if len(noise) == outputs else noise
+    stated, inputs, signals = problem.levels, len(problem.base_model.inputs), len(problem.base_model.signals)
+    noise = (*stated[:inputs], *noise) if len(noise) == signals - inputs else noise
+    noise = (*noise, *stated[signals:]) if len(noise) == signals else noise
     _require(len(noise) == len(stated), "noise: of other signals")
-    ratios = [accepted / known for accepted, known in zip(noise[-outputs:], stated[-outputs:], strict=True)]
-    _require(1.0 <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO, "noise: not plausible")
-    inputs = zip(noise[:-outputs], stated, strict=False)
-    _require(all(known <= accepted < np.inf for accepted, known in inputs), "noise: not plausible")
+    ratios = [accepted / known for accepted, known in zip(noise, stated, strict=True) if known]
+    is_plausible = 1.0 / MAX_NOISE_RATIO <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO
+    _require(is_plausible and 0.0 <= min(noise) <= max(noise) < np.inf, "noise: not plausible")
     return problem.with_levels(noise)
 
 
