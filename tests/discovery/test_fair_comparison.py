@@ -34,6 +34,22 @@ from otolith.twin.kernel import Excitation, kernel_of
 MOTOR = find_twin("dc_motor")
 
 
+def test_a_step_whose_fit_reaches_another_minimum_is_no_component() -> None:
+    """Friction that changes its sign makes the fit of F_v alone fail, where an equivalent component explains the step.
+
+    Values before the step, from which the component is fitted, are no start: the parameter must take its place.
+    """
+    truth = 0.8 * SERVO_AXIS.parameters["F_v"]
+    case = Case("F_v", SERVO_AXIS, Change(parameters={"F_v": truth}), healthy=12, changed=12)
+    state = initial_state("axis", "bench", case.problem)
+    for window in next(recordings(case, case.problem, [5], 1))[10:14]:
+        state, report = adapt(state, window)
+    friction = report.document.parameters["F_v"]
+    assert friction.low is not None
+    assert friction.high is not None
+    assert friction.low <= truth <= friction.high
+
+
 @pytest.mark.parametrize("run", [pytest.param(0, marks=pytest.mark.full), 2])
 def test_a_stiffness_that_moved_far_is_no_periodic_torque(run: int) -> None:
     """The resonance moves by several half waves in a window, so that a fit from the old stiffness ends elsewhere."""

@@ -46,7 +46,7 @@ from otolith.discovery.screening import (
 from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, indices
 from otolith.estimation.timing import delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.components import MAX_COMPONENTS
@@ -201,15 +201,26 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
     best = min(fitted, key=_chi_square)
     if best.type is FaultType.PARAMETER or best.fit.cost > EXPLAINED:
         return fitted
-    values = {free.label: value for free, value in zip(best.problem.free, best.fit.parameters, strict=True)}
     unexplained = [item for item in fitted if item.type is FaultType.PARAMETER and item.fit.cost > EXPLAINED]
-    proposals = []
-    for item in unexplained:
-        own = zip(item.problem.free, item.fit.parameters, strict=True)
-        start = np.array([values.get(free.label, value) for free, value in own])
-        proposals.append(Proposal(item.hypothesis, item.problem, item.fit.prior, start))
-    refitted = dict(zip(unexplained, fit_hypotheses(proposals, fitted[0].fit.window), strict=True))
+    again = fit_hypotheses((_instead_of_components(item, best.fit) for item in unexplained), fitted[0].fit.window)
+    refitted = dict(zip(unexplained, again, strict=True))
     return [min(item, refitted.get(item, item), key=_chi_square) for item in fitted]
+
+
+def _instead_of_components(item: FittedHypothesis, best: Fit) -> Proposal:
+    """Propose ``item`` from parameters that have the effect of what ``best`` has in addition, to first order.
+
+    The values of ``best`` alone would be those of the parameters before they moved.
+    """
+    problem, labels = best.problem, [free.label for free in best.problem.free]
+    added = [indices(problem, slot)[0] for slot in range(len(item.problem.components), len(problem.components))]
+    moved = [labels.index(label) for label in item.name.split(", ") if label in labels]
+    values, slopes = best.parameters.copy(), best.result.jacobian[: -len(best.prior.mean)]
+    values[moved] += np.linalg.lstsq(slopes[:, moved], slopes[:, added] @ values[added])[0]
+    known = dict(zip(labels, values.tolist(), strict=True))
+    own = zip(item.problem.free, item.fit.parameters.tolist(), strict=True)
+    start = np.array([known.get(free.label, value) for free, value in own])
+    return Proposal(item.hypothesis, item.problem, item.fit.prior, start)
 
 
 def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:

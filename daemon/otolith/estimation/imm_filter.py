@@ -192,8 +192,13 @@ class Innovation:
         return self.nis <= nis_limit(float(len(self.sqrt_information)))
 
     def inflate_variance(self, reduced_chi_square: float) -> "Innovation":
-        """Return the same with a larger variance ratio; see :func:`inflate_variance`."""
-        return innovation_of(inflate_variance(self.prediction, reduced_chi_square), self.evidence)
+        """Return the same with a larger variance ratio, after a window that agreed with none before and none after it.
+
+        ``reduced_chi_square`` is that of the window under the null hypothesis.
+        """
+        factor = float(np.clip(reduced_chi_square / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
+        prediction = replace(self.prediction, variance_ratio=self.prediction.variance_ratio * factor)
+        return innovation_of(prediction, self.evidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,15 +279,6 @@ def _limited(evidence: Evidence, sd: Array) -> Evidence:
 def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:
     change = 1.0 + VARIANCE_RATIO_GAIN * (min(nis_per_degree, MAX_NIS_PER_DEGREE) - 1.0)
     return float(np.clip(variance_ratio * change, 1.0, MAX_VARIANCE_RATIO))
-
-
-def inflate_variance(posterior: ImmPosterior, reduced_chi_square: float) -> ImmPosterior:
-    """Return the same with a larger variance ratio, after a window that agreed with none before and none after it.
-
-    ``reduced_chi_square`` is that of the window under the null hypothesis.
-    """
-    factor = float(np.clip(reduced_chi_square / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
-    return replace(posterior, variance_ratio=posterior.variance_ratio * factor)
 
 
 def _recentre(posterior: ImmPosterior) -> ImmPosterior:
