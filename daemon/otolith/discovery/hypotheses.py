@@ -23,6 +23,7 @@ from otolith_drivers.units import equation_text, unit_text
 
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
+MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is not tracked
 MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
 MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay

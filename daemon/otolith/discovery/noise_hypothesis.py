@@ -13,7 +13,7 @@ from math import comb
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
-from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis
+from otolith.discovery.hypotheses import MAX_DEVIANCE, FaultHypothesis, FaultType, FittedHypothesis
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
@@ -38,12 +38,18 @@ MIN_SHRINKING = 0.04  # ratio of a variance after a step to that before
 RIDGE = 0.05  # added to the correlations of slopes, which few random vectors estimate
 
 
-def noisier_signals(null: FittedHypothesis) -> list[FittedHypothesis]:
-    """Return the hypothesis of larger noise, fitted to the window of ``null``, if it leaves white noise."""
-    best = _at_larger_levels(null.fit, null.fit)
-    for _ in range(ROUNDS if null.fit.cost > EXPLAINED else 0):  # far from the null, levels are those of its errors
-        best = _at_larger_levels(best or null.fit, null.fit)
-    return [_hypothesis(best, null)] if best is not None and is_white(best) else []
+def noisier_signals(null: FittedHypothesis, least: float) -> list[FittedHypothesis]:
+    """Return the hypothesis of larger noise, fitted to the window of ``null``, if it leaves white noise.
+
+    There is none if it would be far less likely than the other hypotheses, of which the best leaves χ² of ``least``.
+    """
+    highest, around = least + MAX_DEVIANCE * max(least / null.fit.count, 1.0), null.fit
+    for _ in range(1 + ROUNDS if null.fit.cost > EXPLAINED else 1):  # far from the null, levels are those of its errors
+        best = _at_larger_levels(around, null.fit, highest)
+        if best is None:
+            return []
+        around = best
+    return [_hypothesis(around, null)] if is_white(around) else []
 
 
 def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
@@ -65,13 +71,15 @@ def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypoth
     return hypotheses
 
 
-def _at_larger_levels(around: Fit, null: Fit) -> Fit | None:
+def _at_larger_levels(around: Fit, null: Fit, highest: float) -> Fit | None:
     """Return the window of ``null`` fitted at likely levels around another fit; None if none is larger than stated.
 
-    A sensor that would be useless makes no hypothesis.
+    None as well if χ² and normalisation exceed ``highest``. A sensor that would be useless makes no hypothesis.
     """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
-    trial = _at_likely_levels(replace(around, problem=null.problem).linearised_at_end(), _inputs_without_noise(null))
+    highest += null.objective.innovation_model.log_determinant
+    there, inputs = replace(around, problem=null.problem).linearised_at_end(), _inputs_without_noise(null)
+    trial = _at_likely_levels(there, inputs, highest)
     if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
         return None
     return fit(trial.problem, null.window, _widened(null, trial), null.prior.mean, STEPS)
@@ -98,14 +106,17 @@ def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
     return FittedHypothesis(stated, fitted, normalisation(fitted, null.fit))
 
 
-def _at_likely_levels(stated: Fit, allowed: Mask) -> Fit:
+def _at_likely_levels(stated: Fit, allowed: Mask, highest: float = np.inf) -> Fit:
     """Return the window linearised at likely levels where noise is stated, and of further ``allowed`` places (levels,).
 
     A level that is hardly another one stays as stated, and so does one without which the window is not decisively less
-    likely. Those of states are tried first: they follow nearly everything.
+    likely. Those of states are tried first: they follow nearly everything. If no levels lead to a deviance of at most
+    ``highest``, all stay as stated.
     """
     before, places = np.array(stated.problem.levels), np.arange(len(allowed))
     trial = _most_likely(stated, (before > 0.0) | allowed)
+    if _deviance(trial) > highest:
+        return stated
     ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, 1.0)
     kept = allowed | ((before > 0.0) & ((ratios > MIN_NOISE_FACTOR) | (ratios < 1.0 / MIN_NOISE_FACTOR)))
     trial = _with_levels_of(trial, stated, kept)
@@ -146,9 +157,9 @@ def _most_likely(trial: Fit, places: Mask) -> Fit:
         if 0.5 * float(slope @ step) < VISIBLE:
             break
         bounds = np.maximum(lowest**2, MIN_SHRINKING * variances), highest**2
-        moved = (np.clip(variances + share * step, *bounds) for share in LENGTHS)
+        moved, deviance = (np.clip(variances + share * step, *bounds) for share in LENGTHS), _deviance(trial)
         trials = (_at(trial, np.sqrt(np.where(places, own, variances))) for own in moved)
-        better = next((own for own in trials if _deviance(own) < _deviance(trial)), None)
+        better = next((own for own in trials if _deviance(own) < deviance), None)
         if better is None:
             break
         trial = better
@@ -186,6 +197,8 @@ def likelier_levels_of(fitted: Fit) -> Problem:
     Process noise that is stated too large for that of the sensors makes the predictor follow every sample. The gain of
     a sensor would change how far it follows, and would pass for a cause.
     """
+    if fitted.cost > EXPLAINED:
+        return fitted.problem
     likely = _at_likely_levels(fitted.linearised_at_end(), np.zeros(len(fitted.problem.levels), dtype=np.bool_)).problem
     return likely if (np.array(likely.levels) <= fitted.problem.levels).all() else fitted.problem
 

@@ -20,6 +20,7 @@ from otolith.discovery.candidates import (
     threshold_like,
 )
 from otolith.discovery.hypotheses import (
+    MAX_DEVIANCE,
     FaultHypothesis,
     FaultType,
     FittedHypothesis,
@@ -166,13 +167,14 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     gains = screening.response.score_delays().gain
     fitted += [*changing_commands(fitted[0], gains), *late_signals(fitted[0], gains)]
-    return fitted + noisier_signals(fitted[0])
+    return fitted + noisier_signals(fitted[0], min(map(_chi_square, fitted)))
 
 
 def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
     """Fit beside sines of a place the same errors of sensors: else a force wins for want of a periodic alternative."""
-    known, own = fitted[0].problem.components, screening.fitted
-    added = [component for item in fitted for component in item.problem.components if component not in known]
+    known, own, least = fitted[0].problem.components, screening.fitted, min(map(_chi_square, fitted))
+    near = [item for item in fitted if item.chi_square <= least + MAX_DEVIANCE * max(least / own.count, 1.0)]
+    added = [component for item in near for component in item.problem.components if component not in known]
     errors = periodic_errors(screening.response, added)
     return fit_hypotheses([with_candidate(own.problem, own.prior, error) for error in errors], own.window, FAR_WORSE)
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.hypotheses import (
+    MAX_DEVIANCE,
     FaultType,
     FittedHypothesis,
     HypothesisStep,
@@ -41,7 +42,6 @@ from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit
 
 MAX_HYPOTHESES = 7  # that are tracked after a search
-MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is not tracked
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
