@@ -15,7 +15,10 @@ from benchmarks.discovery.motor import Faults
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.discovery.hypotheses import describe_noise
+from otolith.discovery.hypotheses import FittedHypothesis, describe_noise, nothing_happened
+from otolith.discovery.noise_hypothesis import noisier_signals
+from otolith.discovery.screening import linearised
+from otolith.estimation.information import initial_prior
 from otolith.health.schema import Status
 from tests.discovery.test_search import initial, run, simulated
 
@@ -61,6 +64,15 @@ def test_smooth_errors_are_no_noise() -> None:
     state, documents = run(initial("R_a", "D"), windows)
     assert all(document.decision is not WindowDecision.NOISIER for document in documents)
     assert state.problem.noise == (0.005, 0.02)
+
+
+def test_a_twin_that_diverges_has_no_noise_hypothesis() -> None:
+    problem = initial("J").problem
+    (inertia,) = problem.free
+    problem = replace(problem, free=(replace(inertia, low=1e-9),))
+    unchanged = nothing_happened(problem, initial_prior(problem))
+    diverged = linearised(problem, simulated("steps", 4, Faults())[0], unchanged.prior, np.array([1e-9, 0.0]))
+    assert noisier_signals(FittedHypothesis(unchanged.hypothesis, diverged), least=400.0) == []
 
 
 def test_a_step_of_a_parameter_is_no_noise() -> None:

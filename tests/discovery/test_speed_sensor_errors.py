@@ -98,7 +98,7 @@ def test_at_constant_speed_without_a_current_unbalance_and_sensor_are_one_class(
 
 
 @SEEDS
-def test_at_constant_speed_the_current_refutes_one_of_them(seed: int) -> None:
+def test_at_constant_speed_the_current_is_not_contradicted(seed: int) -> None:
     """An unbalance modulates it, by back-EMF; here by less than its noise, so that many windows must agree."""
     unbalanced, wrong = turning(seed, BOTH, torque=TORQUE, steady=True), turning(seed, BOTH, ripple=RIPPLE, steady=True)
     assert not any(document.components for document in wrong)
@@ -112,4 +112,4 @@ def states_both(document: ReportDocument) -> bool:
         sum(item.probability for item in document.explanations if item.reason == kind and item.text.startswith(place))
         for kind, place in places
     )
-    return torque > 0.0 and sensor == pytest.approx(torque, abs=EQUAL)
+    return torque > 0.1 and sensor == pytest.approx(torque, abs=EQUAL)

@@ -84,9 +84,10 @@ def test_noise_of_inputs_is_restored_and_older_files_lack_it(tmp_path: Path) -> 
     assert document.filter is not None
     assert restored(document, fresh(), START + 30.0).problem.levels == tuple(levels)
     older = with_problem(state, PROBLEM.with_levels((*PROBLEM.levels[:2], *levels[2:])))
-    record = document.filter.model_copy(update={"noise": tuple(levels[2:4])})
-    warm = restored(document.model_copy(update={"filter": record}), fresh(), START + 30.0)
-    assert warm.problem.levels == older.problem.levels
+    for count, known in ((2, older.problem.levels), (0, (*levels[:4], *PROBLEM.levels[4:]))):
+        record = document.filter.model_copy(update={"noise": tuple(levels[count:4])})
+        warm = restored(document.model_copy(update={"filter": record}), fresh(), START + 30.0)
+        assert warm.problem.levels == known
 
 
 @pytest.mark.parametrize("away", [20.0, 8 * 3600.0, YEAR, -3600.0, -YEAR, -START], ids=lambda away: f"{away:g} s")

@@ -20,7 +20,7 @@ from otolith.discovery.decision import (
     alternatives_of,
 )
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_sensors
+from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_levels
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
@@ -67,7 +67,7 @@ OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may be one that is not among them"
 NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
-NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
+NOISE_CONDITION = "the innovations are white, but not as large as [noise] says"
 NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
@@ -124,7 +124,7 @@ class WindowResult:
         return 0 if self.is_accepted else state.contradictions + (self.decision is not WindowDecision.BAD)
 
     def noisier_since(self, state: AdaptationState) -> float | None:
-        """Return from when on sensors are noisier than stated, Unix seconds; None if they are not."""
+        """Return from when on more noise than stated is accepted, Unix seconds; None if none is."""
         is_noisier = self.decision is WindowDecision.NOISIER and self.posterior.problem.stated_noise
         return self.test.onset if is_noisier and self.test else state.noisier_since
 
@@ -365,7 +365,7 @@ def _findings(
     noisier_since: float | None,
     experiment: str,
 ) -> tuple[FindingDocument, ...]:
-    """Return a finding for each component that is not approved, for noisier sensors, and for an open test.
+    """Return a finding for each component that is not approved, for noise that is not as stated, and for an open test.
 
     ``undecided`` is the test if it is still open, and ``experiment`` what would decide it.
     """
@@ -387,7 +387,7 @@ def _noise_finding(problem: Problem, since: float) -> FindingDocument:
         kind=FindingKind.NOISE,
         severity=Severity.WARNING,
         condition=NOISE_CONDITION,
-        text="; ".join(describe_sensors(problem)),
+        text="; ".join(describe_levels(problem)),
         since=since,
         advice=NOISE_ADVICE,
     )

@@ -44,7 +44,7 @@ class AdaptationState:
     pooled: PooledWindows = field(default_factory=PooledWindows)
     """The last windows that the twin explained, which are searched together."""
     noisier_since: float | None = None
-    """Unix seconds from which on sensors are noisier than stated; None if they are not."""
+    """Unix seconds from which on more noise than stated is accepted; None if none is."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
     """Limits and rules by which states and events follow from the reports."""
     health: HealthState = field(default_factory=HealthState)

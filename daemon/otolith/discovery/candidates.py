@@ -68,20 +68,21 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     return [Candidate(component, competing.of(form), competing.is_sensor(form)) for form, component in rows]
 
 
-def periodic_errors(response: LinearResponse, beside: Iterable[Component]) -> list[Candidate]:
+def periodic_errors(response: LinearResponse, beside: Iterable[Component], taken: Iterable[str]) -> list[Candidate]:
     """Return for each component ``beside`` that is a sine of a place: that sine, as the error of a sensor.
 
-    That is the sensor of the place or of its speed. An error that is itself ``beside`` is not returned again.
+    The sensor is that of the place or of its speed. Errors whose keys are ``taken`` are left out.
     """
     problem, twin, starts = response.problem, response.problem.base_model, dict[CandidateForm, list[float]]()
     source_names = [source.name for source in sources(twin)]
     components, signals = {own.key: own for own in beside}, {output.name for output in twin.outputs}
+    excluded = {*problem.excluded, *taken}
     for sine in components.values():
         read = signals & {sine.source, measured_speeds(twin).get(sine.source)}
         for at, site in enumerate(sites(twin)):
             error = key_of(site.name, sine.family, sine.source)
             is_error = sine.periodic and at >= len(twin.sites) and site.into in read
-            if is_error and error not in problem.excluded | components.keys():
+            if is_error and error not in excluded:
                 form = CandidateForm(at, sine.model, source_names.index(sine.source), (sine.low, sine.high))
                 starts.setdefault(form, []).append(sine.inner)
     if not starts:

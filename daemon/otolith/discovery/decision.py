@@ -14,7 +14,7 @@ from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import INNER_BOUND, Component, indices, site_of, slot_of
+from otolith.estimation.problem import Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
@@ -26,6 +26,7 @@ AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
+BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: with a value beyond it, no hypothesis is accepted
 
 
 class WindowDecision(StrEnum):
@@ -105,11 +106,10 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
     leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
-    if not _is_possible(best):
-        return WindowOutcome(WindowDecision.SUSPECTED, best)
     if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
-        return fault
-    if _is_component_accepted(test) and (accepted := _without_undecided_terms(test)).type is FaultType.COMPONENT:
+        return fault if _is_plausible(fault.hypothesis) else WindowOutcome(WindowDecision.SUSPECTED, fault.hypothesis)
+    accepted = _without_undecided_terms(test)
+    if accepted.type is FaultType.COMPONENT and _is_component_accepted(test) and _is_plausible(accepted):
         return WindowOutcome(WindowDecision.DISCOVERED, accepted)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
 
@@ -127,11 +127,11 @@ def _data_fault(test: SequentialTest, *, is_young: bool) -> WindowOutcome | None
     return None
 
 
-def _is_possible(hypothesis: TrackedHypothesis) -> bool:
+def _is_plausible(hypothesis: TrackedHypothesis) -> bool:
     """Whether no positive parameter is far beyond its bounds: a mass that nothing excites may become negative."""
     rows = zip(hypothesis.problem.free, hypothesis.posterior.prior().mean.tolist(), strict=False)  # then come trends
     own = [(free, value) for free, value in rows if free.low > 0.0 and not free.name.startswith("_")]
-    return all(free.low / INNER_BOUND <= value <= free.high * INNER_BOUND for free, value in own)
+    return all(free.low / BEYOND_BOUNDS <= value <= free.high * BEYOND_BOUNDS for free, value in own)
 
 
 def _is_component_accepted(test: SequentialTest) -> bool:

@@ -213,7 +213,7 @@ class TrackedHypothesis:
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Sites of its components and signals of its delays."""
+        """Sites of its components, of errors of sensors their signals, and signals of its delays."""
         twin, read = self.problem.base_model, self.type is FaultType.SENSOR
         own = [site_of(twin, item.site).into if read else item.site for item in self.problem.components]
         return (*own, *(signal for signal, _ in self.problem.delays))
@@ -445,19 +445,22 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
 
 def describe_noise(problem: Problem) -> str:
     """Return which sensors are noisier than stated, and which commands change between their samples."""
-    return "; ".join([*describe_sensors(problem), *map(CHANGING.format, problem.changing)])
+    return "; ".join([*describe_levels(problem), *map(CHANGING.format, problem.changing)])
 
 
-def describe_sensors(problem: Problem) -> list[str]:
-    """Return which sensors are noisier and which states more disturbed than stated, with the levels, one text each."""
+def describe_levels(problem: Problem) -> list[str]:
+    """Return which sensors and states have other noise than stated, with the levels, one text each."""
     twin = problem.base_model
     units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
-    rows = [(f"{name} is noisier than stated", units[name]) for name in twin.signals]
-    rows += [(f"{state.name} is disturbed more than stated", f"{units[state.name]}/√s") for state in twin.states]
+    rows = [(f"{own} is less noisy than stated", f"{own} is noisier than stated", units[own]) for own in twin.signals]
+    rows += [
+        (f"{name} is disturbed less than stated", f"{name} is disturbed more than stated", f"{units[name]}/√s")
+        for name in (state.name for state in twin.states)
+    ]
     return [
-        f"{what}: {noise:.2g}{unit} instead of {stated:.2g}"
-        for (what, unit), noise, stated in zip(rows, problem.levels, problem.stated_levels, strict=True)
-        if noise > stated
+        f"{more if noise > stated else less}: {noise:.2g}{unit} instead of {stated:.2g}"
+        for (less, more, unit), noise, stated in zip(rows, problem.levels, problem.stated_levels, strict=True)
+        if noise != stated
     ]
 
 

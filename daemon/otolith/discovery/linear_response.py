@@ -218,7 +218,8 @@ class LinearResponse(ProjectedResponse):
         with np.errstate(all="ignore"):
             sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
             sums = sums.reshape(-1, machine_sites, count)  # the real part is that of a cosine, the imaginary of a sine
-            sums /= np.abs(sums.view(np.float64)).max(initial=0.0)  # gains are the same; no square overflows
+            size = np.abs(sums.view(np.float64))
+            sums /= size.max(initial=0.0, where=np.isfinite(size))  # gains are the same; no square overflows
             b, probes = sums[:, :, 0], sums[:, :, 1:]
             size = np.einsum("lsp,lsp->ls", probes, probes.conj()).real / PROBES  # trace of S
             skew = np.einsum("lsp,lsp->ls", probes, probes) / PROBES  # S₁₁ - S₂₂ + 2i·S₁₂
@@ -326,7 +327,9 @@ class LinearResponse(ProjectedResponse):
 @lru_cache(maxsize=PROBE_SETS)
 def _probes(seed: int, rows: int) -> Array:
     """Return random vectors (rows, PROBES), which windows of as many records share."""
-    return np.random.default_rng(seed).standard_normal((rows, PROBES))
+    vectors = np.random.default_rng(seed).standard_normal((rows, PROBES))
+    vectors.flags.writeable = False
+    return vectors
 
 
 def chi_square_of_parameters(fitted: Fit) -> float:

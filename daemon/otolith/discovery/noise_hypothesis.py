@@ -25,7 +25,7 @@ from otolith.estimation.window_fit import Fit, fit
 # Thresholds: docs/reference/thresholds-discovery.md has the origin of each.
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
 MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
-VISIBLE = 1.0  # in -2 log likelihood: a step of the levels that gains less is the last one
+MIN_GAIN = 1.0  # in -2 log likelihood: a step of the levels that would gain less is not taken
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
 ROUNDS = 2  # of fitting with the noise and estimating it again
@@ -33,8 +33,8 @@ STEPS = 25  # of Gauss-Newton with the noise
 MAX_REPEATED = 0.1  # share of the samples that repeat the one before: with more, a converter hides the noise
 LEAST_SHARE = 0.05  # of a stated level: the least one that a window can show
 MAX_SCORING = 10  # steps of Fisher scoring
-LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of a step that are tried
-MIN_SHRINKING = 0.04  # ratio of a variance after a step to that before
+STEP_SHARES = (1.0, 0.3, 0.1, 0.03, 0.01)  # of a step of Fisher scoring that are tried
+MIN_VARIANCE_RATIO = 0.04  # least ratio of a variance after a step to that before
 RIDGE = 0.05  # added to the correlations of slopes, which few random vectors estimate
 
 
@@ -43,9 +43,9 @@ def noisier_signals(null: FittedHypothesis, least: float) -> list[FittedHypothes
 
     There is none if it would be far less likely than the other hypotheses, of which the best leaves χ² of ``least``.
     """
-    highest, around = least + MAX_DEVIANCE * max(least / null.fit.count, 1.0), null.fit
+    max_deviance, around = least + MAX_DEVIANCE * max(least / null.fit.count, 1.0), null.fit
     for _ in range(1 + ROUNDS if null.fit.cost > EXPLAINED else 1):  # far from the null, levels are those of its errors
-        best = _at_larger_levels(around, null.fit, highest)
+        best = _at_larger_levels(around, null.fit, max_deviance)
         if best is None:
             return []
         around = best
@@ -71,22 +71,25 @@ def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypoth
     return hypotheses
 
 
-def _at_larger_levels(around: Fit, null: Fit, highest: float) -> Fit | None:
+def _at_larger_levels(around: Fit, null: Fit, max_deviance: float) -> Fit | None:
     """Return the window of ``null`` fitted at likely levels around another fit; None if none is larger than stated.
 
-    None as well if χ² and normalisation exceed ``highest``. A sensor that would be useless makes no hypothesis.
+    None as well if χ² and normalisation exceed ``max_deviance``. A sensor that would be useless makes no hypothesis.
     """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
-    highest += null.objective.innovation_model.log_determinant
-    there, inputs = replace(around, problem=null.problem).linearised_at_end(), _inputs_without_noise(null)
-    trial = _at_likely_levels(there, inputs, highest)
+    max_deviance += null.objective.innovation_model.log_determinant
+    there, inputs = replace(around, problem=null.problem).linearised_at_end(), _inputs_with_unstated_noise(null)
+    trial = _at_likely_levels(there, inputs, max_deviance)
     if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
         return None
     return fit(trial.problem, null.window, _widened(null, trial), null.prior.mean, STEPS)
 
 
 def _widened(null: Fit, trial: Fit) -> Prior:
-    """Return the prior of ``null``, where each parameter is less certain as that of a window is with more noise."""
+    """Return the prior of ``null``, with less certain parameters: earlier windows were as noisy.
+
+    Each standard deviation grows by as much as that of the window alone grows with the noise of ``trial``.
+    """
     rows, free = len(null.prior.mean), len(null.problem.free)
     known, own = (
         information(jacobian[:-rows], np.ones(jacobian.shape[1]), 1.0).sd[:free]
@@ -106,16 +109,16 @@ def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
     return FittedHypothesis(stated, fitted, normalisation(fitted, null.fit))
 
 
-def _at_likely_levels(stated: Fit, allowed: Mask, highest: float = np.inf) -> Fit:
+def _at_likely_levels(stated: Fit, allowed: Mask, max_deviance: float = np.inf) -> Fit:
     """Return the window linearised at likely levels where noise is stated, and of further ``allowed`` places (levels,).
 
-    A level that is hardly another one stays as stated, and so does one without which the window is not decisively less
-    likely. Those of states are tried first: they follow nearly everything. If no levels lead to a deviance of at most
-    ``highest``, all stay as stated.
+    A level within ``MIN_NOISE_FACTOR`` of the stated one stays as it is, as does one without which the window is not
+    decisively less likely. Those of states are tried first: they follow nearly everything. If no levels lead to a
+    deviance of at most ``max_deviance``, all stay as stated.
     """
     before, places = np.array(stated.problem.levels), np.arange(len(allowed))
     trial = _most_likely(stated, (before > 0.0) | allowed)
-    if _deviance(trial) > highest:
+    if _deviance(trial) > max_deviance:
         return stated
     ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, 1.0)
     kept = allowed | ((before > 0.0) & ((ratios > MIN_NOISE_FACTOR) | (ratios < 1.0 / MIN_NOISE_FACTOR)))
@@ -132,7 +135,7 @@ def _with_levels_of(trial: Fit, stated: Fit, places: Mask) -> Fit:
     return _most_likely(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
 
 
-def _inputs_without_noise(stated: Fit) -> Mask:
+def _inputs_with_unstated_noise(stated: Fit) -> Mask:
     """Return which levels (levels,) are those of inputs that show noise where none is stated."""
     levels, highest = np.array(stated.problem.levels), _limits(stated)[1]
     return np.asarray((levels == 0.0) & (highest > 0.0) & np.isfinite(highest))
@@ -147,6 +150,8 @@ def _most_likely(trial: Fit, places: Mask) -> Fit:
     lowest, highest = _limits(trial)
     for _ in range(MAX_SCORING if places.any() else 0):
         variances, squares = np.array(trial.problem.levels) ** 2, LinearResponse(trial).squares_of_noise()
+        if not np.isfinite(squares).all():  # the twin diverges
+            break
         slope, covariance = squares[:, 0] - squares[:, 1:].mean(axis=1), np.cov(squares[:, 1:]) / 2.0
         scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         correlation, free = covariance / np.outer(scale, scale) + RIDGE * np.eye(len(scale)), places
@@ -154,10 +159,10 @@ def _most_likely(trial: Fit, places: Mask) -> Fit:
             inverse = np.linalg.pinv(np.where(np.outer(free, free), correlation, 0.0))
             step = inverse @ (slope / scale) / scale
             free = places & ((variances > lowest**2) | (step > 0.0))
-        if 0.5 * float(slope @ step) < VISIBLE:
+        if 0.5 * float(slope @ step) < MIN_GAIN:
             break
-        bounds = np.maximum(lowest**2, MIN_SHRINKING * variances), highest**2
-        moved, deviance = (np.clip(variances + share * step, *bounds) for share in LENGTHS), _deviance(trial)
+        bounds = np.maximum(lowest**2, MIN_VARIANCE_RATIO * variances), highest**2
+        moved, deviance = (np.clip(variances + share * step, *bounds) for share in STEP_SHARES), _deviance(trial)
         trials = (_at(trial, np.sqrt(np.where(places, own, variances))) for own in moved)
         better = next((own for own in trials if _deviance(own) < deviance), None)
         if better is None:
@@ -167,13 +172,17 @@ def _most_likely(trial: Fit, places: Mask) -> Fit:
 
 
 def _limits(trial: Fit) -> tuple[Array, Array]:
-    """Return the least level of each place, which a converter raises, and the largest that samples of an input show."""
+    """Return the lowest and the highest level (levels,) that may be estimated.
+
+    The lowest is a share of the stated one, or the step of a converter. The highest, of inputs, is what samples show.
+    """
     problem, stated = trial.problem, np.array(trial.problem.stated_levels)
     lowest, inputs = LEAST_SHARE * stated, len(problem.base_model.inputs)
     for at, (output, step) in enumerate(
         zip(problem.base_model.outputs, problem.steps or repeat(0.0), strict=False), inputs
     ):
-        is_coarse = (np.diff(trial.window.readings(output.name)) == 0.0).mean() > MAX_REPEATED
+        values = trial.window.readings(output.name)[~trial.window.missing_in(output.name)]
+        is_coarse = np.count_nonzero(np.diff(values) == 0.0) > MAX_REPEATED * len(values)
         lowest[at] = stated[at] if is_coarse else max(lowest[at], min(step, stated[at]))
     highest = np.full(len(stated), np.inf)
     for at, source in enumerate(problem.base_model.inputs):
@@ -192,7 +201,7 @@ def _deviance(trial: Fit) -> float:
 
 
 def likelier_levels_of(fitted: Fit) -> Problem:
-    """Return the problem of ``fitted`` with the likely levels of its window if all are smaller, else with its own.
+    """Return the problem of ``fitted`` with the likely levels of its window if none is larger, else with its own.
 
     Process noise that is stated too large for that of the sensors makes the predictor follow every sample. The gain of
     a sensor would change how far it follows, and would pass for a cause.

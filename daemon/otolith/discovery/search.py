@@ -171,11 +171,12 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
 
 
 def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Fit beside sines of a place the same errors of sensors: else a force wins for want of a periodic alternative."""
+    """Fit beside sines of a place the same errors of sensors: else only a force would be periodic."""
     known, own, least = fitted[0].problem.components, screening.fitted, min(map(_chi_square, fitted))
     near = [item for item in fitted if item.chi_square <= least + MAX_DEVIANCE * max(least / own.count, 1.0)]
     added = [component for item in near for component in item.problem.components if component not in known]
-    errors = periodic_errors(screening.response, added)
+    taken = {component.key for item in fitted for component in item.problem.components}
+    errors = periodic_errors(screening.response, added, taken)
     return fit_hypotheses([with_candidate(own.problem, own.prior, error) for error in errors], own.window, FAR_WORSE)
 
 
@@ -196,7 +197,7 @@ def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis
 
 
 def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Return the hypotheses; those of moved parameters also fitted from the values of the best, where they are better.
+    """Return the hypotheses; those of moved parameters also fitted from where they have the effect of the best one.
 
     With a component, a fit may reach another minimum. The component needs evidence against the parameters alone there.
     """
@@ -212,7 +213,7 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
 def _instead_of_components(item: FittedHypothesis, best: Fit) -> Proposal:
     """Propose ``item`` from parameters that have the effect of what ``best`` has in addition, to first order.
 
-    The values of ``best`` alone would be those of the parameters before they moved.
+    At the values of ``best`` alone, a fit would start at the parameters before they moved.
     """
     problem, labels = best.problem, [free.label for free in best.problem.free]
     added = [indices(problem, slot)[0] for slot in range(len(item.problem.components), len(problem.components))]

@@ -187,9 +187,9 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
 
 
 def _lines_through_neighbours(times: Array) -> tuple[Array, Array]:
-    """Return the share of the sample before in each line through two neighbours (lines,), and how far it spreads.
+    """Return the weight of the sample before in the line through both neighbours (samples - 2,), and its error.
 
-    ``times`` (samples,) are those of the samples; the spread is relative to that of an ordinary pair of steps.
+    ``times`` (samples,) are those of the samples; the error is relative to that of an ordinary pair of steps.
     """
     steps = np.diff(times)
     product = steps[:-1] * steps[1:]

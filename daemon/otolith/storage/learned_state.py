@@ -60,7 +60,7 @@ class FilterRecord(StrictModel):
     variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
     phase: PhaseAdvance | None
     noise: tuple[float, ...]
-    """Of inputs and states, which older files lack, around that of outputs; empty unless accepted as not as stated."""
+    """Levels of inputs, outputs and states; empty if as stated. Older files lack those of states, or inputs too."""
     steps: tuple[float, ...] = ()  # See otolith.estimation.problem.Problem.steps
     changing: tuple[str, ...] = ()  # See otolith.estimation.problem.Problem.changing
     shifts: tuple[tuple[float, ...], ...] = ()  # See ParameterCusum.sums; empty for none
@@ -245,8 +245,8 @@ def _with_noise(problem: Problem, noise: tuple[float, ...]) -> Problem:
     noise = (*stated[:inputs], *noise) if len(noise) == signals - inputs else noise
     noise = (*noise, *stated[signals:]) if len(noise) == signals else noise
     _require(len(noise) == len(stated), "noise: of other signals")
-    ratios = [accepted / known for accepted, known in zip(noise, stated, strict=True) if known]
-    is_plausible = 1.0 / MAX_NOISE_RATIO <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO
+    ratios = [accepted / known for accepted, known in zip(noise[inputs:signals], problem.noise, strict=True)]
+    is_plausible = 1.0 / MAX_NOISE_RATIO <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO  # of sensors
     _require(is_plausible and 0.0 <= min(noise) <= max(noise) < np.inf, "noise: not plausible")
     return problem.with_levels(noise)
 
