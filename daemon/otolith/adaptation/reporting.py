@@ -68,7 +68,9 @@ NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may 
 NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the innovations are white, but not as large as [noise] says"
-NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
+NOISE_ADVICE = (
+    "if it was always so, correct [noise] or [process_noise]; otherwise inspect the sensor, its cable and its supply"
+)
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
 

@@ -108,9 +108,9 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
     if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
         return fault if _is_plausible(fault.hypothesis) else WindowOutcome(WindowDecision.SUSPECTED, fault.hypothesis)
-    accepted = _without_undecided_terms(test)
-    if accepted.type is FaultType.COMPONENT and _is_component_accepted(test) and _is_plausible(accepted):
-        return WindowOutcome(WindowDecision.DISCOVERED, accepted)
+    if _is_component_accepted(test) and (accepted := _without_undecided_terms(test)).type is FaultType.COMPONENT:
+        is_plausible = _is_plausible(accepted)
+        return WindowOutcome(WindowDecision.DISCOVERED if is_plausible else WindowDecision.SUSPECTED, accepted)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
 
 

@@ -218,8 +218,8 @@ class LinearResponse(ProjectedResponse):
         with np.errstate(all="ignore"):
             sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
             sums = sums.reshape(-1, machine_sites, count)  # the real part is that of a cosine, the imaginary of a sine
-            size = np.abs(sums.view(np.float64))
-            sums /= size.max(initial=0.0, where=np.isfinite(size))  # gains are the same; no square overflows
+            magnitudes = np.abs(sums.view(np.float64))
+            sums /= magnitudes.max(initial=0.0, where=np.isfinite(magnitudes))  # gains stay; no square overflows
             b, probes = sums[:, :, 0], sums[:, :, 1:]
             size = np.einsum("lsp,lsp->ls", probes, probes.conj()).real / PROBES  # trace of S
             skew = np.einsum("lsp,lsp->ls", probes, probes) / PROBES  # S₁₁ - S₂₂ + 2i·S₁₂

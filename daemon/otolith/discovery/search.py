@@ -197,7 +197,7 @@ def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis
 
 
 def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Return the hypotheses; those of moved parameters also fitted from where they have the effect of the best one.
+    """Return the hypotheses; those of moved parameters are also fitted from values with the effect of the best one.
 
     With a component, a fit may reach another minimum. The component needs evidence against the parameters alone there.
     """
