@@ -108,9 +108,8 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
     if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
         return fault if _is_plausible(fault.hypothesis) else WindowOutcome(WindowDecision.SUSPECTED, fault.hypothesis)
-    if _is_component_accepted(test) and (accepted := _without_undecided_terms(test)).type is FaultType.COMPONENT:
-        is_plausible = _is_plausible(accepted)
-        return WindowOutcome(WindowDecision.DISCOVERED if is_plausible else WindowDecision.SUSPECTED, accepted)
+    if _is_component_accepted(test) and (chosen := _without_undecided_terms(test)).type is FaultType.COMPONENT:
+        return WindowOutcome(WindowDecision.DISCOVERED if _is_plausible(chosen) else WindowDecision.SUSPECTED, chosen)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
 
 
