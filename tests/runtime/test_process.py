@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,43 @@ def test_a_child_gets_messages_but_no_group_signals() -> None:
     assert replies == [("a", True)]
     child.stop(PATIENCE)
     assert not child.alive
+
+
+def test_a_write_that_a_busy_computer_delays_reaches_no_later_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that sends is stopped just before it writes to a child, until that is dead and the next one runs."""
+    begun, proceeds, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def write(descriptor: int, data: bytes) -> int:
+        if begun.is_set():
+            return os.write(descriptor, data)
+        begun.set()
+        assert proceeds.wait(PATIENCE)
+        try:
+            return os.write(descriptor, data)
+        finally:
+            ended.set()
+
+    child = ChildProcess("echo", "tests.runtime.test_process:echo", room=2)
+    child.start()
+    monkeypatch.setattr("multiprocessing.connection.Connection._send.__defaults__", (write,))
+    child.offer("to the first")
+    assert begun.wait(PATIENCE)
+    child.kill()
+    child.start()
+    proceeds.set()
+    assert ended.wait(PATIENCE)
+    child.offer("to the second")
+    replies: list[object] = []
+
+    def has_replied() -> bool:
+        replies.extend(child.replies())
+        return bool(replies)
+
+    try:
+        wait_for(has_replied)
+    finally:
+        child.kill()
+    assert replies == [("to the second", True)]
 
 
 @pytest.mark.timed

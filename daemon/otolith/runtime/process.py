@@ -60,14 +60,11 @@ def _run_main(connection: Any, main: str, arguments: Sequence[Any]) -> None:
         sys.exit(f"{multiprocessing.current_process().name}: {error}")
 
 
-def _send_queued(outbox: queue.Queue[Any], connection: Any) -> None:
-    # The main thread may close the connection during a write, whose descriptor is then None: a TypeError.
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        while True:
-            message = outbox.get()
-            connection.send(message)
-            if message is None:
-                return
+def _send_queued(outbox: queue.Queue[Any], connection: multiprocessing.connection.Connection) -> None:
+    with connection, contextlib.suppress(OSError, ValueError):
+        connection.send(message := outbox.get())
+        while message is not None:
+            connection.send(message := outbox.get())
 
 
 class ChildProcess:
@@ -112,7 +109,9 @@ class ChildProcess:
             try:
                 process.start()
                 self._process = process
-                sending = self._outbox, self._connection
+                # A descriptor that only the thread closes: the next pipe gets the number of a closed one, and a write
+                # that had begun would reach the next process.
+                sending = self._outbox, multiprocessing.connection.Connection(os.dup(self._connection.fileno()))
                 threading.Thread(target=_send_queued, args=sending, name=f"to-{self.name}", daemon=True).start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
