@@ -19,10 +19,10 @@ from otolith.adaptation.state import (
     with_posterior,
     with_records,
 )
+from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO, InputNoiseSums
 from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.decision import (
     MAX_COST,
-    UPDATES,
     AdoptedComponent,
     PosteriorUpdate,
     WindowDecision,
@@ -34,7 +34,7 @@ from otolith.discovery.decision import (
     with_approvals,
 )
 from otolith.discovery.hypotheses import CHANGING, FaultType
-from otolith.discovery.noise_hypothesis import likelier_levels_of
+from otolith.discovery.noise_hypothesis import likelier_levels_of, widening
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
@@ -159,7 +159,8 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
         result = _update_filter_beside(state, tested, test)
     else:
         result = _apply_decision(state, tested, test, is_new=is_new)
-    return _with_pooled(state, tested, replace(result, searched=test is not None, cusum=cusum))
+    result = _with_pooled(state, tested, replace(result, searched=test is not None, cusum=cusum))
+    return _with_input_noise(state, tested, result)
 
 
 def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
@@ -261,6 +262,29 @@ def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: Window
     return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
 
 
+def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
+    """Return the result of a window; if windows together show the noise of an input, it is estimated with that noise.
+
+    A test that is open then ends: without that noise, windows differ by more than parameters and sensors explain.
+    """
+    fitted = tested.estimated.fit
+    has_disagreed = tested.predicted.belief.variance_ratio > SUMMED_RATIO
+    if not (result.searched or has_disagreed or fitted.window.index % SUMMED_EVERY == 0):
+        return result
+    sums = state.input_noise.after(fitted)
+    result = replace(result, input_noise=sums)
+    levels = None if result.update is PosteriorUpdate.HYPOTHESIS else sums.levels(fitted)
+    if levels is None:
+        return result
+    problem = fitted.problem.with_levels(levels)
+    stated, noisier = (replace(fitted, problem=own).linearised_at_end() for own in (fitted.problem, problem))
+    again = _TestedEstimate.of(tested.predicted.with_noise(problem, widening(stated, noisier)), fitted.window)
+    accepted = _update_filter(replace(state, test=None), again)
+    if not again.is_expected or accepted.decision is not WindowDecision.LEARNED:
+        return result
+    return replace(accepted, decision=WindowDecision.NOISIER, before=accepted.after, searched=result.searched)
+
+
 def _reset_moved(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
     """Return the result of a window that, with those before, shows a change of the parameters at ``moved``.
 
@@ -324,8 +348,10 @@ def _next_state(
     A posterior that replaces the filter's contains what windows before have shown: their test, sums and pool end.
     """
     test, cusum, pooled = result.test, result.cusum or state.cusum, result.pooled or state.pooled
-    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
+    input_noise = result.input_noise or state.input_noise
+    if result.update is PosteriorUpdate.HYPOTHESIS:
         test, cusum, pooled = None, ParameterCusum(), PooledWindows()
+        input_noise = InputNoiseSums() if result.decision is WindowDecision.NOISIER else input_noise
     elif result.decision in DATA_FAULTS:  # the error of a sensor shifts no parameter
         cusum = state.cusum
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
@@ -339,6 +365,7 @@ def _next_state(
         adopted=result.adopted,
         cusum=cusum,
         pooled=pooled,
+        input_noise=input_noise,
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,

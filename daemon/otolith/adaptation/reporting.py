@@ -8,14 +8,17 @@ import numpy as np
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
+from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.decision import (
     ACCEPTED,
     COMPONENT_PROBABILITY,
     COMPONENT_WINDOWS,
+    UPDATES,
     AdoptedComponent,
     Alternative,
     Approval,
+    PosteriorUpdate,
     WindowDecision,
     alternatives_of,
 )
@@ -95,6 +98,7 @@ class WindowResult:
     searched: bool = False  # Whether other hypotheses were compared
     cusum: ParameterCusum | None = None  # After this window; None for a window that was not estimated from
     pooled: PooledWindows | None = None  # With this window, if the twin explained it
+    input_noise: InputNoiseSums | None = None  # With this window, if it was added
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result
@@ -117,6 +121,11 @@ class WindowResult:
         return self.decision in ACCEPTED
 
     @property
+    def update(self) -> PosteriorUpdate:
+        """How the window changed the posterior."""
+        return UPDATES[self.decision]
+
+    @property
     def is_explained(self) -> bool:
         """Whether the best hypothesis of an open test explains the window up to the noise."""
         return self.test is None or self.test.explains_window
@@ -127,8 +136,9 @@ class WindowResult:
 
     def noisier_since(self, state: AdaptationState) -> float | None:
         """Return from when on more noise than stated is accepted, Unix seconds; None if none is."""
-        is_noisier = self.decision is WindowDecision.NOISIER and self.posterior.problem.stated_noise
-        return self.test.onset if is_noisier and self.test else state.noisier_since
+        if self.decision is not WindowDecision.NOISIER or not self.posterior.problem.stated_noise:
+            return state.noisier_since
+        return self.test.onset if self.test else state.noisier_since or self.posterior.belief.end
 
 
 def make_report(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
@@ -43,6 +44,8 @@ class AdaptationState:
     """By how much the estimates of windows have differed from their predictions, all the same way."""
     pooled: PooledWindows = field(default_factory=PooledWindows)
     """The last windows that the twin explained, which are searched together."""
+    input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
+    """What windows show of the noise of inputs for which none is stated."""
     noisier_since: float | None = None
     """Unix seconds from which on more noise than stated is accepted; None if none is."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)

@@ -16,17 +16,16 @@ from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.commissioning.consistency import (
     MAX_OUTLYING_SHARE,
     OUTLYING,
-    InputNoise,
     Whiteness,
     changes_of_the_machine,
     consistency_test,
     inflate_process_noise,
-    input_noise,
     outlyingness,
     regimes,
     sqrt_information,
     whiteness,
 )
+from otolith.commissioning.input_noise import InputNoise, input_noise
 from otolith.commissioning.likelihood import (
     Fits,
     FittedWindow,

@@ -37,7 +37,7 @@ class WindowDecision(StrEnum):
     STEPPED = "two windows agree on a sudden change"
     DISCOVERED = "several windows agree on a new component"
     FADED = "a component is no longer there"
-    NOISIER = "two windows agree that a signal is less certain than stated"
+    NOISIER = "several windows agree that a signal is less certain than stated"
     AMBIGUOUS = "several hypotheses explain the windows equally well: what they agree on is estimated"
     SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
     TIMING = "a signal is late: its delay does not count as a change of a parameter"

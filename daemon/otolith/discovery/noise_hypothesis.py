@@ -12,12 +12,12 @@ from math import comb
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Mask
+from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.hypotheses import MAX_DEVIANCE, FaultHypothesis, FaultType, FittedHypothesis
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
-from otolith.estimation.information import Prior, information
+from otolith.estimation.information import information
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
@@ -78,17 +78,22 @@ def _at_larger_levels(around: Fit, null: Fit, max_deviance: float) -> Fit | None
     """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
     max_deviance += null.objective.innovation_model.log_determinant
-    there, inputs = replace(around, problem=null.problem).linearised_at_end(), _inputs_with_unstated_noise(null)
+    unstated = unstated_input_noise(null.problem, null.window) > 0.0
+    inputs = np.pad(unstated, (0, len(stated) - len(unstated)))
+    there = replace(around, problem=null.problem).linearised_at_end()
     trial = _at_likely_levels(there, inputs, max_deviance)
     if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
         return None
-    return fit(trial.problem, null.window, _widened(null, trial), null.prior.mean, STEPS)
+    scale = widening(null, trial)
+    prior = replace(null.prior, covariance=null.prior.covariance * np.outer(scale, scale))
+    return fit(trial.problem, null.window, prior, null.prior.mean, STEPS)
 
 
-def _widened(null: Fit, trial: Fit) -> Prior:
-    """Return the prior of ``null``, with less certain parameters: earlier windows were as noisy.
+def widening(null: Fit, trial: Fit) -> Array:
+    """Return factors (2 free,) on the standard deviations of the prior of ``null``: earlier windows were as noisy.
 
-    Each standard deviation grows by as much as that of the window alone grows with the noise of ``trial``.
+    Each standard deviation grows by as much as that of the window alone grows with the noise of ``trial``. Trends
+    follow the parameters.
     """
     rows, free = len(null.prior.mean), len(null.problem.free)
     known, own = (
@@ -96,8 +101,7 @@ def _widened(null: Fit, trial: Fit) -> Prior:
         for jacobian in (null.result.first[2], trial.result.first[2])
     )
     ratios = np.divide(own, known, out=np.ones(free), where=np.isfinite(own) & np.isfinite(known))
-    scale = np.resize(np.maximum(ratios, 1.0), rows)  # trends follow the parameters
-    return replace(null.prior, covariance=null.prior.covariance * np.outer(scale, scale))
+    return np.resize(np.maximum(ratios, 1.0), rows)
 
 
 def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
@@ -135,10 +139,16 @@ def _with_levels_of(trial: Fit, stated: Fit, places: Mask) -> Fit:
     return _most_likely(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
 
 
-def _inputs_with_unstated_noise(stated: Fit) -> Mask:
-    """Return which levels (levels,) are those of inputs that show noise where none is stated."""
-    levels, highest = np.array(stated.problem.levels), _limits(stated)[1]
-    return np.asarray((levels == 0.0) & (highest > 0.0) & np.isfinite(highest))
+def unstated_input_noise(problem: Problem, window: Window) -> Array:
+    """Return the level (inputs,) that the samples of each input show where none is stated; zero elsewhere."""
+    stated = np.array(problem.levels[: len(problem.base_model.inputs)])
+    shown = np.array([_shown(source.name, window) for source in problem.base_model.inputs])
+    return np.where((stated == 0.0) & np.isfinite(shown), shown, 0.0)
+
+
+def _shown(signal: str, window: Window) -> float:
+    differences = np.abs(sample_differences(signal, window))
+    return MAD_TO_SD * median(differences) if len(differences) else 0.0
 
 
 def _most_likely(trial: Fit, places: Mask) -> Fit:
@@ -186,8 +196,7 @@ def _limits(trial: Fit) -> tuple[Array, Array]:
         lowest[at] = stated[at] if is_coarse else max(lowest[at], min(step, stated[at]))
     highest = np.full(len(stated), np.inf)
     for at, source in enumerate(problem.base_model.inputs):
-        differences = np.abs(sample_differences(source.name, trial.window))
-        highest[at] = max(MAD_TO_SD * median(differences) if len(differences) else 0.0, stated[at])
+        highest[at] = max(_shown(source.name, trial.window), stated[at])
     return lowest, highest
 
 

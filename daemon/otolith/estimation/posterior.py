@@ -166,6 +166,11 @@ class Posterior:
         belief = imm_filter.set_all_modes(self.belief, prior.mean / size, prior.covariance / np.outer(size, size))
         return replace(self, belief=belief)
 
+    def with_noise(self, problem: Problem, widening: Array) -> "Posterior":
+        """Return the same for a ``problem`` with other noise; standard deviations grow by factors (2 free,)."""
+        covariance = self.belief.covariance * np.outer(widening, widening)
+        return replace(self, problem=problem, belief=replace(self.belief, covariance=covariance, variance_ratio=1.0))
+
     def reset_value(self, index: int, value: float, sd: float) -> "Posterior":
         """Return the same with an independent ``value`` ± ``sd`` of one parameter or trend, in its unit."""
         scale = _size(self.problem)[index]
