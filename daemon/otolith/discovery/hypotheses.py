@@ -177,6 +177,11 @@ def residual_variance_factor(chi_squares: Iterable[float], count: float) -> floa
     return max(min(chi_squares) / count, 1.0)
 
 
+def largest_chi_square(least: float, count: float) -> float:
+    """Return the χ² above which a hypothesis is far less likely than the best one, which leaves ``least``."""
+    return least + MAX_DEVIANCE * max(least / count, 1.0)
+
+
 def evidence_factor(fitted: Iterable[FittedHypothesis]) -> float:
     """Return by what the evidence of a search is divided, at least one: what even the best hypothesis leaves.
 

@@ -13,7 +13,7 @@ from math import comb
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.discovery.hypotheses import MAX_DEVIANCE, FaultHypothesis, FaultType, FittedHypothesis
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis, largest_chi_square
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
@@ -43,7 +43,7 @@ def noisier_signals(null: FittedHypothesis, least: float) -> list[FittedHypothes
 
     There is none if it would be far less likely than the other hypotheses, of which the best leaves χ² of ``least``.
     """
-    max_deviance, around = least + MAX_DEVIANCE * max(least / null.fit.count, 1.0), null.fit
+    max_deviance, around = largest_chi_square(least, null.fit.count), null.fit
     for _ in range(1 + ROUNDS if null.fit.cost > EXPLAINED else 1):  # far from the null, levels are those of its errors
         best = _at_larger_levels(around, null.fit, max_deviance)
         if best is None:

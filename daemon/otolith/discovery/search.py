@@ -20,7 +20,6 @@ from otolith.discovery.candidates import (
     threshold_like,
 )
 from otolith.discovery.hypotheses import (
-    MAX_DEVIANCE,
     FaultHypothesis,
     FaultType,
     FittedHypothesis,
@@ -28,6 +27,7 @@ from otolith.discovery.hypotheses import (
     all_parameters_moved,
     delay_score,
     is_possible,
+    largest_chi_square,
     nothing_happened,
     residual_variance_factor,
     with_candidate,
@@ -172,8 +172,9 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
 
 def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
     """Fit beside sines of a place the same errors of sensors: else only a force would be periodic."""
-    known, own, least = fitted[0].problem.components, screening.fitted, min(map(_chi_square, fitted))
-    near = [item for item in fitted if item.chi_square <= least + MAX_DEVIANCE * max(least / own.count, 1.0)]
+    known, own = fitted[0].problem.components, screening.fitted
+    limit = largest_chi_square(min(map(_chi_square, fitted)), own.count)
+    near = [item for item in fitted if item.chi_square <= limit]
     added = [component for item in near for component in item.problem.components if component not in known]
     taken = {component.key for item in fitted for component in item.problem.components}
     errors = periodic_errors(screening.response, added, taken)
