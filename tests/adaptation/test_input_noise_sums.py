@@ -1,13 +1,16 @@
 """The noise of a measured input that no window shows alone is learned from all windows together."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from benchmarks.changes.healthy import MACHINES, cases
-from benchmarks.changes.observe import recordings
+from benchmarks.changes.machines import DC_MOTOR, TWO_MASS
+from benchmarks.changes.observe import Case, recordings
+from benchmarks.changes.plants import HEALTHY, Plant, Values
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.discovery.decision import WindowDecision
@@ -54,5 +57,40 @@ def test_fast_changes_that_drive_the_machine_are_no_noise(feedback: float) -> No
     """A controller that feeds the noise of the position back moves the force by up to a third."""
     problem, windows, _ = recorded(1e-6, 1, roughness=0.0 if feedback else 0.5, feedback=feedback)
     state, documents = run(initial_state("axis", "test", replace(problem, input_noise=())), windows)
+    assert not any(state.problem.input_noise)
+    assert all(document.decision is not WindowDecision.NOISIER for document in documents)
+
+
+def rough_operation(random: np.random.Generator, times: Array) -> Values:
+    operation = TWO_MASS.operate(random, times)
+    return {**operation, "T_load": operation["T_load"] + 0.05 * random.standard_normal(len(times))}
+
+
+def late_load(random: np.random.Generator, plant: Plant, rows: dict[str, Array], by: int) -> None:
+    rows["T_load"] = np.r_[np.full(by, rows["T_load"][0]), rows["T_load"][:-by]]
+
+
+@pytest.mark.parametrize("by", [1, 3])
+def test_a_late_load_with_fast_changes_is_no_noise(by: int) -> None:
+    """Its error correlates with the fast changes of the load as noise does, but the delay explains all of it."""
+    plant = replace(TWO_MASS, operate=rough_operation)
+    case = Case("late", plant, HEALTHY, healthy=12, changed=0, disturb=partial(late_load, by=by))
+    (windows,) = recordings(case, case.problem, range(1), seed=7)
+    state, documents = run(initial_state("two_mass", "test", case.problem), windows)
+    assert not any(state.problem.input_noise)
+    assert {document.decision for document in documents[2:]} == {WindowDecision.TIMING}
+
+
+def noise_in_one_window(random: np.random.Generator, plant: Plant, rows: dict[str, Array]) -> None:
+    noise = 6e-4 * random.standard_normal(len(rows["T_load"]))
+    first = 14 * plant.records
+    rows["T_load"][first : first + plant.records] += noise[first : first + plant.records]
+
+
+def test_noise_that_has_ended_gives_no_level() -> None:
+    """The window after it shows changes of 1e-9 N·m: accepted as its level, they would end the search for noise."""
+    case = Case("ended", DC_MOTOR, HEALTHY, healthy=24, changed=0, disturb=noise_in_one_window)
+    (windows,) = recordings(case, case.problem, range(1), seed=7)
+    state, documents = run(initial_state("dc_motor", "test", case.problem), windows)
     assert not any(state.problem.input_noise)
     assert all(document.decision is not WindowDecision.NOISIER for document in documents)

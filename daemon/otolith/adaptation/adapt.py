@@ -265,7 +265,8 @@ def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: Window
 def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
     """Return the result of a window; if windows together show the noise of an input, it is estimated with that noise.
 
-    A test that is open then ends: without that noise, windows differ by more than parameters and sensors explain.
+    A test that is open then ends: without that noise, windows differ by more than parameters and sensors explain. It
+    goes on if a late signal leads: the error of one with fast changes correlates with them as noise does.
     """
     fitted = tested.estimated.fit
     has_disagreed = tested.predicted.belief.variance_ratio > SUMMED_RATIO
@@ -273,7 +274,8 @@ def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: W
         return result
     sums = state.input_noise.after(fitted)
     result = replace(result, input_noise=sums)
-    levels = None if result.update is PosteriorUpdate.HYPOTHESIS else sums.levels(fitted)
+    is_late = result.test is not None and result.test.best.type is FaultType.TIMING
+    levels = None if result.update is PosteriorUpdate.HYPOTHESIS or is_late else sums.levels(fitted)
     if levels is None:
         return result
     problem = fitted.problem.with_levels(levels)

@@ -17,7 +17,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow
-from otolith.discovery.noise_hypothesis import unstated_input_noise
+from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, unstated_input_noise
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.minimisers import continued
 from otolith.estimation.objective import EXPLAINED
@@ -131,12 +131,16 @@ class InputNoiseSums:
         return InputNoiseSums(self.windows + 1, summed)
 
     def levels(self, fitted: Fit) -> tuple[float, ...] | None:
-        """Return the levels of the problem of ``fitted`` with the noise that the sums show; None if they show none."""
+        """Return the levels of the problem of ``fitted`` with the noise that the sums show; None if they show none.
+
+        Noise that is larger than what the samples of this window show has ended: its level would be that of no noise.
+        """
         shown = unstated_input_noise(fitted.problem, fitted.window).tolist()
         levels = list(fitted.problem.levels)
         for at, (own, level) in enumerate(zip(self.sums, shown, strict=False)):
-            if level and own.deviate > SIGNIFICANT_SUM and self.windows >= MIN_SUMMED:
-                levels[at] = min(float(np.sqrt(own.observed / own.expected)), level)
+            noise = float(np.sqrt(own.observed / own.expected)) if own.deviate > SIGNIFICANT_SUM else np.inf
+            if noise < MIN_NOISE_FACTOR * level and self.windows >= MIN_SUMMED:
+                levels[at] = min(noise, level)
         return None if tuple(levels) == fitted.problem.levels else tuple(levels)
 
 
@@ -158,8 +162,7 @@ def _correlation(fit: FittedWindow, name: str, level: float, draws: int, random:
     for noise in level * random.standard_normal((draws, window.records)):
         moved = response(noise)
         expected += float((moved - basis @ (basis.T @ moved)) @ response(_fast(window, noise)))
-    observed = float(fit.result.residuals @ fast)
-    return Correlation(observed, expected / draws / level**2, max(fit.cost, 1.0) ** 2 * power)
+    return Correlation(float(fit.result.residuals @ fast), expected / draws / level**2, max(fit.cost, 1.0) ** 2 * power)
 
 
 def _fast(window: Window, values: Array) -> Array:
