@@ -94,3 +94,18 @@ def test_noise_that_has_ended_gives_no_level() -> None:
     state, documents = run(initial_state("dc_motor", "test", case.problem), windows)
     assert not any(state.problem.input_noise)
     assert all(document.decision is not WindowDecision.NOISIER for document in documents)
+
+
+def later_noise(random: np.random.Generator, plant: Plant, rows: dict[str, Array]) -> None:
+    noise = LOAD_NOISE * random.standard_normal(len(rows["T_load"]))
+    noise[: 30 * plant.records] = 0.0
+    rows["T_load"] += noise
+
+
+def test_noise_that_begins_later_has_the_right_level() -> None:
+    """Thirty calm windows before it do not lower the level."""
+    case = Case("later", TWO_MASS, HEALTHY, healthy=60, changed=0, disturb=later_noise)
+    (windows,) = recordings(case, case.problem, range(1), seed=7)
+    state, documents = run(initial_state("two_mass", "test", case.problem), windows)
+    assert all(document.decision is not WindowDecision.NOISIER for document in documents[:30])
+    assert state.problem.input_noise == pytest.approx([0.0, LOAD_NOISE], rel=0.35)

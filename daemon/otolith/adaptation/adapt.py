@@ -280,10 +280,14 @@ def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: W
         return result
     problem = fitted.problem.with_levels(levels)
     stated, noisier = (replace(fitted, problem=own).linearised_at_end() for own in (fitted.problem, problem))
-    again = _TestedEstimate.of(tested.predicted.with_noise(problem, widening(stated, noisier)), fitted.window)
+    wider = widening(stated, noisier)
+    again = _TestedEstimate.of(tested.predicted.with_noise(problem, wider), fitted.window)
     accepted = _update_filter(replace(state, test=None), again)
     if not again.is_expected or accepted.decision is not WindowDecision.LEARNED:
         return result
+    if result.is_mixture:  # what the hypotheses differ in stays uncertain: one of them may hold beside the noise
+        posterior = accepted.posterior.set_prior(result.after).with_noise(problem, wider)
+        accepted = replace(accepted, posterior=posterior, after=posterior.prior())
     return replace(accepted, decision=WindowDecision.NOISIER, before=accepted.after, searched=result.searched)
 
 

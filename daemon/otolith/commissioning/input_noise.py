@@ -33,6 +33,7 @@ SIGNIFICANT_SUM = 4.0  # standard deviations: the sums are tested after each win
 MIN_SUMMED, SUMMED_EVERY = 4, 8  # windows: least number, and one of so many that is always added
 SUMMED_RATIO = 1.2  # ratio of variances above which windows differ by more than they should: then each is added
 FORGETTING = 0.98  # of the sums, with each window that is added
+RISEN = 3.0  # times the largest changes before: the sums begin again, as noise may have begun
 MIN_POWER = 1e-6  # χ² of what the fast changes of an input do to a window: less shows nothing
 ALONE_STEPS = 10  # of Gauss-Newton without prior
 
@@ -44,6 +45,7 @@ class Correlation:
     observed: float = 0.0
     expected: float = 0.0  # For noise of unit variance, in the square of the input's unit
     variance: float = 0.0  # Of ``observed``, if nothing is noise
+    shown: float = 0.0  # Largest changes from sample to sample of the windows
 
     def plus(self, other: "Correlation", kept: float = 1.0) -> "Correlation":
         """Return the sum, with a share ``kept`` of this one."""
@@ -51,6 +53,7 @@ class Correlation:
             kept * self.observed + other.observed,
             kept * self.expected + other.expected,
             kept**2 * self.variance + other.variance,
+            max(self.shown, other.shown),
         )
 
     @property
@@ -122,12 +125,13 @@ class InputNoiseSums:
         sums = self.sums or (Correlation(),) * len(shown)
         rows = zip(fitted.problem.base_model.inputs, shown.tolist(), strict=True)
         added = [
-            _limited(_correlation(own, source.name, level, RUNNING_DRAWS, random), level)
+            _limited(_correlation(own, source.name, level, RUNNING_DRAWS, random))
             if level and not window.missing_in(source.name).any()
             else Correlation()
             for source, level in rows
         ]
-        summed = tuple(old.plus(new, FORGETTING) for old, new in zip(sums, added, strict=True))
+        since = [old if new.shown <= RISEN * old.shown else Correlation() for old, new in zip(sums, added, strict=True)]
+        summed = tuple(old.plus(new, FORGETTING) for old, new in zip(since, added, strict=True))
         return InputNoiseSums(self.windows + 1, summed)
 
     def levels(self, fitted: Fit) -> tuple[float, ...] | None:
@@ -144,9 +148,9 @@ class InputNoiseSums:
         return None if tuple(levels) == fitted.problem.levels else tuple(levels)
 
 
-def _limited(own: Correlation, shown: float) -> Correlation:
-    """Return the correlation of one window, observed no larger than if all that is ``shown`` were noise."""
-    most = shown**2 * own.expected + SIGNIFICANT_SHARE * float(np.sqrt(own.variance))
+def _limited(own: Correlation) -> Correlation:
+    """Return the correlation of one window, observed no larger than if all that it has shown were noise."""
+    most = own.shown**2 * own.expected + SIGNIFICANT_SHARE * float(np.sqrt(own.variance))
     return replace(own, observed=min(own.observed, most))
 
 
@@ -162,7 +166,8 @@ def _correlation(fit: FittedWindow, name: str, level: float, draws: int, random:
     for noise in level * random.standard_normal((draws, window.records)):
         moved = response(noise)
         expected += float((moved - basis @ (basis.T @ moved)) @ response(_fast(window, noise)))
-    return Correlation(float(fit.result.residuals @ fast), expected / draws / level**2, max(fit.cost, 1.0) ** 2 * power)
+    observed, variance = float(fit.result.residuals @ fast), max(fit.cost, 1.0) ** 2 * power
+    return Correlation(observed, expected / draws / level**2, variance, level)
 
 
 def _fast(window: Window, values: Array) -> Array:
