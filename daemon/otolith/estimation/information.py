@@ -105,7 +105,7 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
         observed = singular > MIN_SINGULAR * singular[0]
         inverse = rows[observed].T / singular[observed]
         covariance = inverse @ inverse.T
-        deviation = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+        deviation = np.sqrt(np.maximum(covariance.diagonal(), np.finfo(float).tiny))
         blind = np.abs(rows[~observed]).max(axis=0, initial=0.0) > MAX_BLIND_SHARE
         sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * inflation)
         correlation[np.ix_(alive, alive)] = np.where(
@@ -228,7 +228,7 @@ def classify(
     return Identifiability.WEAK, weak + bound
 
 
-@dataclass(frozen=True, eq=False)  # no slots: the fits of a window share the whitening
+@dataclass(frozen=True, eq=False)  # no slots: what follows from it is computed once
 class Prior:
     """A normal distribution of the parameters at the end of a window, then of their trends per second."""
 
@@ -236,10 +236,15 @@ class Prior:
     covariance: Array  # (2 free, 2 free)
 
     @cached_property
+    def sd(self) -> Array:
+        """(2 free,) standard deviations."""
+        return np.asarray(np.sqrt(self.covariance.diagonal()))
+
+    @cached_property
     def whitening(self) -> Array:
         """(2 free, 2 free) matrix that makes deviations from the mean independent with unit variance."""
-        size = np.sqrt(np.diag(self.covariance))
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance / np.outer(size, size))) / size)
+        correlation = self.covariance / np.outer(self.sd, self.sd)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(correlation)) / self.sd)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
