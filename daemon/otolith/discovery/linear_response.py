@@ -107,7 +107,7 @@ class ProjectedResponse(ABC):
 
     def _score_block(self, guesses: list[Guess]) -> ScoreStatistics:
         counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        first = np.cumsum(counts) - counts
         pairs = np.column_stack([first, first + counts - 1])
         return self.score_responses(self.responses(basis_functions(guesses)), pairs)
 
