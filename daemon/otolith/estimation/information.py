@@ -128,7 +128,7 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     inverse = np.linalg.pinv(root / size, rcond=MIN_SINGULAR)
     # Sums over the draws: C in all but the last row and column, g in the last column.
     moments, bias = np.zeros((len(size) + 1, len(size) + 1)), np.zeros(len(residual))
-    scale, draws = np.append(size, 1.0), 0
+    scale, draws = np.concatenate([size, [1.0]]), 0
     for change in islice(changes, NOISE_DRAWS):
         moments, draws = moments + (change / scale).T @ (change / scale), draws + 1
         bias = inverse.T @ moments[:-1, -1] / draws
@@ -326,7 +326,8 @@ class MapObjective:
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
         curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
         of_states = jacobian[:, count:] * (self.high - self.low)[count:]
-        columns = eliminate_states(np.column_stack([jacobian[:, :count], residuals, curvature]), of_states)  # J, r, N
+        columns = np.concatenate([jacobian[:, :count], residuals[:, None], curvature], axis=1)  # J, r, N
+        columns = eliminate_states(columns, of_states)
         basis, root = np.linalg.qr(columns[:, :count])  # J = QR
         rotated = basis.T @ columns[:, count:]
         residual, noise = rotated[:, 0], rotated[:, 1:]  # b and N, in the directions that R measures
@@ -359,7 +360,7 @@ def second_order_change(objective: Objective, guess: Array, jacobian: Array) -> 
     _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
     kept = singular > MIN_CURVED_SINGULAR * singular[0]
     steps = directions[kept] / singular[kept, None] / size
-    around = np.vstack([guess + steps, guess - steps, guess[None]])
+    around = np.concatenate([guess + steps, guess - steps, guess[None]])
     inside = np.clip(around, objective.low, objective.high)
     with np.errstate(over="ignore", invalid="ignore"):
         residuals = objective.residuals(objective.predict(inside)).reshape(len(around), -1)

@@ -184,7 +184,7 @@ class Objective:
             moved, slopes = noisier.linearise_with_trends(guess) if has_trends else noisier.linearise(guess)
             if not slopes.any():
                 return
-            yield np.column_stack([slopes - jacobian, moved - residuals])
+            yield np.concatenate([slopes - jacobian, (moved - residuals)[:, None]], axis=1)
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
