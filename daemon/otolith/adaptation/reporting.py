@@ -203,9 +203,8 @@ def _parameters(
 
 def _marginals(result: WindowResult) -> list[MarginalPosterior]:
     """Return what is known of each free parameter at the end of the window."""
-    after = result.after
-    free = len(after.mean) // 2
-    sd, sd_before = (np.sqrt(np.diag(prior.covariance)) for prior in (after, result.before))
+    after, free = result.after, len(result.after.mean) // 2
+    sd, sd_before = after.sd, result.before.sd
     return [
         MarginalPosterior(
             value=float(after.mean[index]),

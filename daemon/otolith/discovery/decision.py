@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
 
-import numpy as np
-
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
@@ -251,14 +249,13 @@ def alternatives_of(test: SequentialTest, to: TrackedHypothesis) -> tuple[Altern
 def count_fading(adopted: tuple[AdoptedComponent, ...], posterior: Posterior) -> tuple[AdoptedComponent, ...]:
     """Return the components with the number of windows in which each was not significant."""
     prior = posterior.prior()
-    deviations = np.sqrt(np.diag(prior.covariance))
     counted = []
     for item in adopted:
         slot = slot_of(posterior.problem, item.component)
         if slot is not None:
             index = indices(posterior.problem, slot)[0]
             amplitude, discovered = abs(float(prior.mean[index])), abs(item.component.amplitude)
-            doubt = INSIGNIFICANT * float(deviations[index])
+            doubt = INSIGNIFICANT * float(prior.sd[index])
             visible = doubt < discovered  # otherwise no window could show it
             gone = amplitude < INSIGNIFICANT_SHARE * discovered or (visible and amplitude < doubt)
             item = replace(item, fading=item.fading + 1 if gone else 0)  # noqa: PLW2901 - the counted item

@@ -54,7 +54,7 @@ def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[st
     tried = list(moves(problem, situation))
     reaches = np.array([_interval_after(problem, known, situation, move) for move in tried]).reshape(len(tried), -1)
     required = problem.determined_within * problem.scale
-    present = QUANTILE * np.sqrt(np.diag(known.covariance))
+    present = QUANTILE * known.sd
     advice = {}
     for index, parameter in enumerate(problem.free):
         if parameter.name not in wanted or not tried:
@@ -128,7 +128,7 @@ def _interval_after(problem: Problem, known: Prior, situation: Situation, move: 
         columns += range(base, base + len(twin.states))
         jacobian = (slopes[:, :, columns] / np.array(problem.noise)[None, :, None]).reshape(-1, len(columns))
         information = jacobian.T @ jacobian
-    deviations = np.sqrt(np.diag(known.covariance)[:free])
+    deviations = known.sd[:free]
     if not np.isfinite(information).all():
         return QUANTILE * deviations
     prior = np.zeros(information.shape)
@@ -137,7 +137,7 @@ def _interval_after(problem: Problem, known: Prior, situation: Situation, move: 
     total = information + prior
     size = np.sqrt(np.maximum(np.diag(total), REGULARISATION))
     covariance = np.linalg.pinv(total / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    drift = 0.5 * grid.length * np.sqrt(np.diag(known.covariance)[free:])  # from the middle of the window to its end
+    drift = 0.5 * grid.length * known.sd[free:]  # from the middle of the window to its end
     reach: Array = QUANTILE * np.sqrt(np.maximum(np.diag(covariance)[:free], 0.0) + drift**2)
     return np.minimum(reach, QUANTILE * deviations)
 

@@ -276,8 +276,7 @@ def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evide
     """Whether ``evidence`` can update the prediction without losing all digits; always for the null hypothesis."""
     if hypothesis.type is FaultType.NOTHING:
         return True
-    deviations = np.sqrt(np.diag(predicted.prior().covariance))
-    relative = np.abs(evidence.sqrt_information) * deviations
+    relative = np.abs(evidence.sqrt_information) * predicted.prior().sd
     return bool((relative < MAX_GAIN_OF_INFORMATION).all())  # also false for not-a-number
 
 
@@ -392,10 +391,8 @@ def without_insignificant(tracked: TrackedHypothesis) -> TrackedHypothesis:
 
 def _significance(posterior: Posterior) -> Array:
     """Return the amplitudes (components,) in their standard deviations."""
-    prior = posterior.prior()
-    deviations = np.sqrt(np.diag(prior.covariance))
-    amplitudes = amplitude_indices(posterior.problem)
-    return np.abs(prior.mean[amplitudes]) / deviations[amplitudes]
+    prior, amplitudes = posterior.prior(), amplitude_indices(posterior.problem)
+    return np.abs(prior.mean[amplitudes]) / prior.sd[amplitudes]
 
 
 def _equals_null(tracked: TrackedHypothesis, null: TrackedHypothesis) -> bool:

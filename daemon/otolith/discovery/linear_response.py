@@ -107,8 +107,8 @@ class ProjectedResponse(ABC):
 
     def _score_block(self, guesses: list[Guess]) -> ScoreStatistics:
         counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-        pairs = np.column_stack([first, first + counts - 1])
+        first = np.cumsum(counts) - counts
+        pairs = np.array([first, first + counts - 1]).T
         return self.score_responses(self.responses(basis_functions(guesses)), pairs)
 
     def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
@@ -136,7 +136,7 @@ class ProjectedResponse(ABC):
             a_2 = np.where(single, 0.0, (b_2 - cross / n_11 * b_1) / (n_22 * independence))
             gain = a_1 * b_1 + a_2 * b_2
         valid = np.isfinite(gain) & np.isfinite(a_1) & np.isfinite(a_2) & (independence > MIN_INDEPENDENCE)
-        amplitudes = np.where(valid[:, None], np.column_stack([a_1, a_2]), 0.0)
+        amplitudes = np.where(valid, [a_1, a_2], 0.0).T
         return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
 
 
@@ -254,7 +254,7 @@ class LinearResponse(ProjectedResponse):
         vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, rows)
         shared = self._basis.T @ vectors[: len(self._basis)] + self._prior_basis.T @ vectors[len(self._basis) :]
         probes = vectors[: len(self._basis)] - self._basis @ shared
-        signals = np.column_stack([self._remainder, probes])
+        signals = np.concatenate([self._remainder[:, None], probes], axis=1)
         return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, signals)
 
     def squares_of_noise(self) -> Array:

@@ -343,6 +343,8 @@ def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices],
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:
     """Return the records of each run of one and the same value that is long enough, among the ``present`` ones."""
     ends = np.flatnonzero(np.diff(values[present]) != 0.0) + 1
+    if len(present) - len(ends) < MIN_FROZEN_RUN:
+        return []
     edges = np.concatenate([[0], ends, [len(present)]])
     long = np.flatnonzero(np.diff(edges) >= MIN_FROZEN_RUN)
     return [present[edges[run] : edges[run + 1]] for run in long]
@@ -501,8 +503,10 @@ def repeated_records(window: Window, outputs: Mask) -> Mask:
     errors are those of one record: that in the middle counts.
     """
     changes = np.abs(np.diff(_last_samples(window, outputs), axis=0))
-    images = np.logical_not(window.missing[:, outputs].any(axis=1))
     same = (changes == 0.0).all(axis=1)
+    if not same.any():
+        return np.zeros(window.records, dtype=np.bool_)
+    images = np.logical_not(window.missing[:, outputs].any(axis=1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     repeated = np.zeros(window.records, dtype=np.bool_)
     elsewhere = np.ones(len(changes), dtype=np.bool_)

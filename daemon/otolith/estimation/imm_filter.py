@@ -267,9 +267,10 @@ def _limited(evidence: Evidence, sd: Array) -> Evidence:
 
     Beyond it the innovation's covariance is singular up to rounding, as where an axis stands still for long steps.
     """
-    directions, precision, _ = np.linalg.svd(evidence.sqrt_information * sd)
-    if precision.max(initial=0.0) <= MAX_PRECISION:
+    relative = evidence.sqrt_information * sd
+    if np.abs(relative).sum() <= MAX_PRECISION:  # no singular value is larger than this sum
         return evidence
+    directions, precision, _ = np.linalg.svd(relative)
     factors = np.ones(len(directions))
     factors[: len(precision)] = MAX_PRECISION / np.maximum(precision, MAX_PRECISION)
     reduced = (directions * factors).T
@@ -278,7 +279,7 @@ def _limited(evidence: Evidence, sd: Array) -> Evidence:
 
 def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:
     change = 1.0 + VARIANCE_RATIO_GAIN * (min(nis_per_degree, MAX_NIS_PER_DEGREE) - 1.0)
-    return float(np.clip(variance_ratio * change, 1.0, MAX_VARIANCE_RATIO))
+    return min(max(variance_ratio * change, 1.0), MAX_VARIANCE_RATIO)
 
 
 def _recentre(posterior: ImmPosterior) -> ImmPosterior:

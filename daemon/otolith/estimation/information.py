@@ -105,7 +105,7 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
         observed = singular > MIN_SINGULAR * singular[0]
         inverse = rows[observed].T / singular[observed]
         covariance = inverse @ inverse.T
-        deviation = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+        deviation = np.sqrt(np.maximum(covariance.diagonal(), np.finfo(float).tiny))
         blind = np.abs(rows[~observed]).max(axis=0, initial=0.0) > MAX_BLIND_SHARE
         sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * inflation)
         correlation[np.ix_(alive, alive)] = np.where(
@@ -128,7 +128,7 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     inverse = np.linalg.pinv(root / size, rcond=MIN_SINGULAR)
     # Sums over the draws: C in all but the last row and column, g in the last column.
     moments, bias = np.zeros((len(size) + 1, len(size) + 1)), np.zeros(len(residual))
-    scale, draws = np.append(size, 1.0), 0
+    scale, draws = np.concatenate([size, [1.0]]), 0
     for change in islice(changes, NOISE_DRAWS):
         moments, draws = moments + (change / scale).T @ (change / scale), draws + 1
         bias = inverse.T @ moments[:-1, -1] / draws
@@ -228,7 +228,7 @@ def classify(
     return Identifiability.WEAK, weak + bound
 
 
-@dataclass(frozen=True, eq=False)  # no slots: the fits of a window share the whitening
+@dataclass(frozen=True, eq=False)  # no slots: what follows from it is computed once
 class Prior:
     """A normal distribution of the parameters at the end of a window, then of their trends per second."""
 
@@ -236,10 +236,15 @@ class Prior:
     covariance: Array  # (2 free, 2 free)
 
     @cached_property
+    def sd(self) -> Array:
+        """(2 free,) standard deviations."""
+        return np.asarray(np.sqrt(self.covariance.diagonal()))
+
+    @cached_property
     def whitening(self) -> Array:
         """(2 free, 2 free) matrix that makes deviations from the mean independent with unit variance."""
-        size = np.sqrt(np.diag(self.covariance))
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance / np.outer(size, size))) / size)
+        correlation = self.covariance / np.outer(self.sd, self.sd)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(correlation)) / self.sd)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,7 +326,8 @@ class MapObjective:
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
         curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
         of_states = jacobian[:, count:] * (self.high - self.low)[count:]
-        columns = eliminate_states(np.column_stack([jacobian[:, :count], residuals, curvature]), of_states)  # J, r, N
+        columns = np.concatenate([jacobian[:, :count], residuals[:, None], curvature], axis=1)  # J, r, N
+        columns = eliminate_states(columns, of_states)
         basis, root = np.linalg.qr(columns[:, :count])  # J = QR
         rotated = basis.T @ columns[:, count:]
         residual, noise = rotated[:, 0], rotated[:, 1:]  # b and N, in the directions that R measures
@@ -354,7 +360,7 @@ def second_order_change(objective: Objective, guess: Array, jacobian: Array) -> 
     _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
     kept = singular > MIN_CURVED_SINGULAR * singular[0]
     steps = directions[kept] / singular[kept, None] / size
-    around = np.vstack([guess + steps, guess - steps, guess[None]])
+    around = np.concatenate([guess + steps, guess - steps, guess[None]])
     inside = np.clip(around, objective.low, objective.high)
     with np.errstate(over="ignore", invalid="ignore"):
         residuals = objective.residuals(objective.predict(inside)).reshape(len(around), -1)

@@ -78,7 +78,7 @@ def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> Fi
         chi_square = float(residuals @ residuals)
         if chi_square < reached.chi_square:
             converged = _is_negligible(reached.chi_square, chi_square)
-            reached = replace(reached, guess=trial, residuals=residuals, jacobian=jacobian, chi_square=chi_square)
+            reached = FitResult(trial, residuals, jacobian, chi_square, evaluations, converged, reached.first)
             damping = max(damping / 10.0, MIN_DAMPING)
         else:
             converged = chi_square - reached.chi_square <= MIN_IMPROVEMENT

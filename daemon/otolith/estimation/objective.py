@@ -50,14 +50,15 @@ class Objective:
         """
         twin = problem.twin
         self.kernel = kernel_of(twin)
-        self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
-        self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
+        outputs = [window.signals.index(output.name) for output in twin.outputs]
+        self.measured, self.present = window.values.take(outputs, axis=1), ~window.missing.take(outputs, axis=1)
+        self._counts = np.maximum(self.present.sum(axis=0), 1.0)
         self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
         self._seed = problem.seed + window.index
-        levels = zip((twin.base or twin).inputs, problem.input_noise, strict=False)
+        self._base = problem.base_model
         self._noisy_inputs = [
-            (column, level, np.flatnonzero(~window.missing_in(source.name)))
-            for column, (source, level) in enumerate(levels)
+            (column, level, np.flatnonzero(~window.missing_in(self._base.inputs[column].name)))
+            for column, level in enumerate(problem.input_noise)
             if level
         ]
         self.noise = self._noise_model(problem, window)
@@ -74,11 +75,8 @@ class Objective:
         states = (f"initial {state.name}" for state in twin.states)
         self.names = (*(parameter.label for parameter in problem.free), *states)
         self._open_loop = problem.open_loop
-        self._limits = (
-            TRUNCATION * self.noise.outputs,
-            MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS,
-        )
-        self._base = twin.base or twin
+        limit = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
+        self._limits = TRUNCATION * self.noise.outputs, limit
         measured = np.where(self.present, self.measured, np.nan)
         self.excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
         """Inputs, measurements, gain and sub-steps of the predictor."""
@@ -103,12 +101,11 @@ class Objective:
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
-            needed = self.kernel.substeps(full, initial, replace(corrected, substeps=substeps), *self._limits)
+            needed = self.kernel.substeps(full, initial, corrected, *self._limits)
             if needed <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
             uncorrected = replace(uncorrected, substeps=needed)
-        self.innovation_model = model
-        self.excitation = corrected
+        self.innovation_model, self.excitation = model, corrected
 
     def is_resolved(self, parameters: Array, initial: Array) -> bool:
         """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
@@ -118,9 +115,10 @@ class Objective:
     def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
         """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
         twin = self._base
-        reduced = replace(excitation, inputs=excitation.inputs[:, : len(twin.inputs)])
+        if excitation.inputs.shape[1] > len(twin.inputs):
+            excitation = replace(excitation, inputs=excitation.inputs[:, : len(twin.inputs)])
         parameters, initial = parameters[: len(twin.parameters)], initial[: len(twin.states)]
-        model = kernel_of(twin).predictor(parameters, initial, reduced, self.noise, open_loop=self._open_loop)
+        model = kernel_of(twin).predictor(parameters, initial, excitation, self.noise, open_loop=self._open_loop)
         extra = self._states - len(twin.states)
         return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
 
@@ -139,8 +137,8 @@ class Objective:
         return np.concatenate([parameters, self._first])
 
     def without_trends(self, guess: Array) -> Array:
-        """Return the guess (free + states,) that a ``guess`` with trends contains."""
-        return np.concatenate([guess[: self.free], guess[2 * self.free :]])
+        """Return the guess (..., free + states) that a ``guess`` with trends contains."""
+        return np.concatenate([guess[..., : self.free], guess[..., 2 * self.free :]], axis=-1)
 
     def parameters(self, guesses: Array) -> Array:
         """Return all parameters of the twin (particles, parameters) for guesses (particles, free, ...)."""
@@ -170,10 +168,8 @@ class Objective:
         while self._noisy_inputs:
             inputs = self.excitation.inputs.copy()
             for column, level, sampled in self._noisy_inputs:
-                errors = level * random.standard_normal(len(sampled))
-                inputs[:, column] += _held(
-                    errors, sampled, self.excitation.grid.offsets, self._base.inputs[column].hold
-                )
+                hold, errors = self._base.inputs[column].hold, level * random.standard_normal(len(sampled))
+                inputs[:, column] += _held(errors, sampled, self.excitation.grid.offsets, hold)
             noisier = copy(self)
             noisier.excitation = replace(self.excitation, inputs=inputs)
             yield noisier
@@ -188,7 +184,7 @@ class Objective:
             moved, slopes = noisier.linearise_with_trends(guess) if has_trends else noisier.linearise(guess)
             if not slopes.any():
                 return
-            yield np.column_stack([slopes - jacobian, moved - residuals])
+            yield np.concatenate([slopes - jacobian, (moved - residuals)[:, None]], axis=1)
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
@@ -252,22 +248,18 @@ class Objective:
     def rmse(self, predicted: Array) -> Array:
         """Return the RMSE (outputs,) of a prediction (records, outputs), each in its unit, over measured records."""
         errors = np.where(self.present, self.measured - predicted, 0.0)
-        counts = np.maximum(self.present.sum(axis=0), 1.0)
-        return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
+        return np.asarray(np.sqrt((errors**2).sum(axis=0) / self._counts))
 
     def _noise_model(self, problem: Problem, window: Window) -> NoiseModel:
-        twin = problem.twin.base or problem.twin
-        measured = zip(self.measured.T, self.present.T, strict=True)
+        twin = self._base
         known = problem.steps or (0.0,) * len(twin.outputs)
-        rounding = [
-            rounding_variance(values[present], noise, step)
-            for (values, present), noise, step in zip(measured, problem.noise, known, strict=True)
-        ]
+        samples = zip(self.measured.T, self.present.T, problem.noise, known, strict=True)
+        rounding = [rounding_variance(values[present], noise, step) for values, present, noise, step in samples]
         outputs = np.sqrt(np.array(problem.noise) ** 2 + np.array(rounding))
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
         inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
         error = window.bridge_error
-        at_records = held = np.tile(inputs, (window.records, 1))
+        at_records = held = np.full((window.records, len(inputs)), inputs)
         if error is not None:
             columns = [window.signals.index(driven.name) for driven in twin.inputs]
             at_records = np.sqrt(inputs**2 + error.variance[:, columns])

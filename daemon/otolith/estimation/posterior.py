@@ -132,11 +132,11 @@ class Posterior:
         filter lags behind a drift that accelerates.
         """
         prior, free = self.prior(), len(self.problem.free)
-        trend, sd_of_trend = prior.mean[free:], np.sqrt(np.diag(prior.covariance)[free:])
-        expected = np.hstack([np.eye(free), trend_response])
+        trend, sd_of_trend = prior.mean[free:], prior.sd[free:]
+        expected = np.concatenate([np.eye(free), trend_response], axis=1)
         difference = values - expected @ prior.mean
         drift = length * np.maximum(np.abs(trend) - QUANTILE * sd_of_trend, 0.0)
-        variance = self.belief.variance_ratio * sd**2 + np.diag(expected @ prior.covariance @ expected.T)
+        variance = self.belief.variance_ratio * sd**2 + (expected @ prior.covariance @ expected.T).diagonal()
         counted = np.isfinite(variance) & (np.abs(difference) > drift)
         counted &= [not parameter.name.startswith("_") for parameter in self.problem.free]
         return np.where(counted, difference / np.sqrt(np.where(counted, variance, 1.0)), 0.0)

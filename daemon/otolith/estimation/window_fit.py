@@ -6,6 +6,7 @@ of the window alone, and searches with a particle swarm where the prediction doe
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -54,7 +55,7 @@ EQUALLY_GOOD = 9.0  # difference in χ² between two explanations that are equal
 MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: its χ² is computed once
 class Fit:
     """The maximum a-posteriori fit of a window under a prior."""
 
@@ -70,10 +71,10 @@ class Fit:
         """χ² of window and prior."""
         return self.result.chi_square
 
-    @property
+    @cached_property
     def window_chi_square(self) -> float:
         """χ² of the window alone."""
-        residuals = self.innovations.ravel()
+        residuals = self.result.residuals[: -len(self.prior.mean)]
         return float(residuals @ residuals)
 
     @property
@@ -151,7 +152,7 @@ class Fit:
         free, rows = len(self.problem.free), len(self.prior.mean)
         jacobian, trends = self.result.jacobian[:-rows], slice(free, 2 * free)
         residuals = self.result.residuals[:-rows] - jacobian[:, trends] @ self.result.guess[trends]
-        there = self.guess, residuals, np.delete(jacobian, trends, axis=1)
+        there = self.guess, residuals, self.objective.without_trends(jacobian)
         return FitResult(*there, float(residuals @ residuals), 0, False, there)
 
     def advance(self) -> PhaseAdvance:
@@ -314,18 +315,18 @@ def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
     alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
     inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
-    rows, values = _without_input_noise(objective, alone)
-    uncertainty = information(rows, objective.high - objective.low, inflation)
+    root, values = _without_input_noise(objective, alone)
+    uncertainty = information(root, objective.high - objective.low, inflation)
     return _BothFits(fitted, alone, inflation, uncertainty, values, evaluations + alone.evaluations)
 
 
 def _without_input_noise(objective: Objective, alone: FitResult) -> tuple[Array, Array]:
-    """Return Jacobian (rows, guess) and values (guess,) of the window alone, without the bias by noisy inputs."""
+    """Return square-root information and values (guess,) of the window alone, without the bias by noisy inputs."""
     changes = objective.changes_by_input_noise(alone.guess, alone.residuals, alone.jacobian)
-    _, root = np.linalg.qr(alone.jacobian)
+    root = np.asarray(np.linalg.qr(alone.jacobian, mode="r"))
     unbiased, moved = without_input_noise(root, np.zeros(len(root)), changes)
     if unbiased is root:
-        return alone.jacobian, alone.guess
+        return root, alone.guess
     width = objective.high - objective.low
     step = -width * np.linalg.lstsq(unbiased * width, moved, rcond=MIN_SINGULAR)[0]
     return unbiased, np.clip(alone.guess + step, objective.low, objective.high)

@@ -318,7 +318,7 @@ class Kernel:
             with np.errstate(invalid="ignore"):
                 error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
                 allowed = np.maximum(tolerance, RELATIVE_TOLERANCE * np.abs(fine).max(axis=(0, 1), initial=0.0))
-            if np.all(error <= allowed):
+            if (error <= allowed).all():
                 break
             count *= 2
             excitation = replace(excitation, substeps=count)
