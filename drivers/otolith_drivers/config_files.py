@@ -66,14 +66,14 @@ def _in_order(limits: tuple[float, float]) -> tuple[float, float]:
 Range = Annotated[tuple[float, float], AfterValidator(_in_order)]
 
 
-class ClosedModel(BaseModel):
+class DocumentModel(BaseModel):
     """A document: unknown keys are errors, values are finite and immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class StrictModel(ClosedModel):
-    """A table of a file that a person writes: a closed document that refuses values of another type."""
+class StrictModel(DocumentModel):
+    """A table of a file: a document that also refuses values of another type."""
 
     @model_validator(mode="before")
     @classmethod

@@ -34,7 +34,7 @@ from otolith.discovery.decision import (
     with_approvals,
 )
 from otolith.discovery.hypotheses import CHANGING, FaultType
-from otolith.discovery.noise_hypothesis import likelier_levels_of, widening
+from otolith.discovery.noise_hypothesis import likelier_levels_of, prior_inflation
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
@@ -265,28 +265,29 @@ def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: Window
 def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
     """Return the result of a window; if windows together show the noise of an input, it is estimated with that noise.
 
-    A test that is open then ends: without that noise, windows differ by more than parameters and sensors explain. It
-    goes on if a late signal leads: the error of one with fast changes correlates with them as noise does.
+    A test that is open then ends. While a late signal leads it, or a sensor is faulty, its windows are not summed: such
+    errors correlate with fast changes as noise does.
     """
     fitted = tested.estimated.fit
     has_disagreed = tested.predicted.belief.variance_ratio > SUMMED_RATIO
-    if not (result.searched or has_disagreed or fitted.window.index % SUMMED_EVERY == 0):
+    is_due = result.searched or has_disagreed or fitted.window.index % SUMMED_EVERY == 0
+    is_late = result.test is not None and result.test.best.type is FaultType.TIMING
+    if is_late or result.decision in DATA_FAULTS or not is_due:
         return result
     sums = state.input_noise.after(fitted)
     result = replace(result, input_noise=sums)
-    is_late = result.test is not None and result.test.best.type is FaultType.TIMING
-    levels = None if result.update is PosteriorUpdate.HYPOTHESIS or is_late else sums.levels(fitted)
+    levels = None if result.update is PosteriorUpdate.HYPOTHESIS else sums.levels(fitted)
     if levels is None:
         return result
     problem = fitted.problem.with_levels(levels)
     stated, noisier = (replace(fitted, problem=own).linearised_at_end() for own in (fitted.problem, problem))
-    wider = widening(stated, noisier)
-    again = _TestedEstimate.of(tested.predicted.with_noise(problem, wider), fitted.window)
+    inflation = prior_inflation(stated, noisier)
+    again = _TestedEstimate.of(tested.predicted.with_noise(problem, inflation), fitted.window)
     accepted = _update_filter(replace(state, test=None), again)
     if not again.is_expected or accepted.decision is not WindowDecision.LEARNED:
         return result
     if result.is_mixture:  # what the hypotheses differ in stays uncertain: one of them may hold beside the noise
-        posterior = accepted.posterior.set_prior(result.after).with_noise(problem, wider)
+        posterior = accepted.posterior.set_prior(result.after).with_noise(problem, inflation)
         accepted = replace(accepted, posterior=posterior, after=posterior.prior())
     return replace(accepted, decision=WindowDecision.NOISIER, before=accepted.after, searched=result.searched)
 
@@ -351,7 +352,8 @@ def _next_state(
 ) -> AdaptationState:
     """Return the state for the next window.
 
-    A posterior that replaces the filter's contains what windows before have shown: their test, sums and pool end.
+    A posterior that replaces the filter's contains what earlier windows have shown: their test, the cumulative sums of
+    parameters and the pool end. The sums of the noise of inputs end only with accepted noise.
     """
     test, cusum, pooled = result.test, result.cusum or state.cusum, result.pooled or state.pooled
     input_noise = result.input_noise or state.input_noise

@@ -70,7 +70,7 @@ OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may be one that is not among them"
 NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
-NOISE_CONDITION = "the innovations are white, but not as large as [noise] says"
+NOISE_CONDITION = "the noise is not as large as [noise] or [process_noise] says"
 NOISE_ADVICE = (
     "if it was always so, correct [noise] or [process_noise]; otherwise inspect the sensor, its cable and its supply"
 )

@@ -17,11 +17,11 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow
-from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, unstated_input_noise
+from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.minimisers import continued
 from otolith.estimation.objective import EXPLAINED
-from otolith.estimation.window_fit import Fit
+from otolith.estimation.window_fit import ALONE_STEPS, Fit
 from otolith.twin.definition import Input
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
@@ -35,7 +35,6 @@ SUMMED_RATIO = 1.2  # ratio of variances above which windows differ by more than
 FORGETTING = 0.98  # of the sums, with each window that is added
 RISEN = 3.0  # times the largest changes before: the sums begin again, as noise may have begun
 MIN_POWER = 1e-6  # χ² of what the fast changes of an input do to a window: less shows nothing
-ALONE_STEPS = 10  # of Gauss-Newton without prior
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,8 @@ class Correlation:
     observed: float = 0.0
     expected: float = 0.0  # For noise of unit variance, in the square of the input's unit
     variance: float = 0.0  # Of ``observed``, if nothing is noise
-    shown: float = 0.0  # Largest changes from sample to sample of the windows
+    bound: float = 0.0  # Largest changes from sample to sample of the windows
+    windows: int = 0  # That are summed
 
     def plus(self, other: "Correlation", kept: float = 1.0) -> "Correlation":
         """Return the sum, with a share ``kept`` of this one."""
@@ -53,7 +53,8 @@ class Correlation:
             kept * self.observed + other.observed,
             kept * self.expected + other.expected,
             kept**2 * self.variance + other.variance,
-            max(self.shown, other.shown),
+            max(self.bound, other.bound),
+            self.windows + other.windows,
         )
 
     @property
@@ -108,49 +109,48 @@ def input_noise(fits: Fits, source: Input, shown: float, seed: int) -> InputNois
 class InputNoiseSums:
     """What the windows of a running twin show of the noise of inputs for which none is stated."""
 
-    windows: int = 0
     sums: tuple[Correlation, ...] = ()  # Of each input; empty before the first window
 
     def after(self, fitted: Fit) -> "InputNoiseSums":
         """Return the sums with the window of a fit, if the twin explains it without its prior."""
-        window, shown = fitted.window, unstated_input_noise(fitted.problem, fitted.window)
-        if not shown.any() or fitted.problem.open_loop:
-            return replace(self, windows=self.windows + 1)
+        window, bounds = fitted.window, input_noise_bounds(fitted.problem, fitted.window)
+        if not bounds.any() or fitted.problem.open_loop:
+            return self
         objective = fitted.objective
         alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
         own = FittedWindow(window, objective, alone.guess, alone)
         if own.cost > EXPLAINED:
             return self
         random = np.random.default_rng((fitted.problem.seed, window.index))
-        sums = self.sums or (Correlation(),) * len(shown)
-        rows = zip(fitted.problem.base_model.inputs, shown.tolist(), strict=True)
+        sums = self.sums or (Correlation(),) * len(bounds)
+        rows = zip(fitted.problem.base_model.inputs, bounds.tolist(), strict=True)
         added = [
             _limited(_correlation(own, source.name, level, RUNNING_DRAWS, random))
             if level and not window.missing_in(source.name).any()
             else Correlation()
             for source, level in rows
         ]
-        since = [old if new.shown <= RISEN * old.shown else Correlation() for old, new in zip(sums, added, strict=True)]
+        since = [old if new.bound <= RISEN * old.bound else Correlation() for old, new in zip(sums, added, strict=True)]
         summed = tuple(old.plus(new, FORGETTING) for old, new in zip(since, added, strict=True))
-        return InputNoiseSums(self.windows + 1, summed)
+        return InputNoiseSums(summed)
 
     def levels(self, fitted: Fit) -> tuple[float, ...] | None:
         """Return the levels of the problem of ``fitted`` with the noise that the sums show; None if they show none.
 
-        Noise that is larger than what the samples of this window show has ended: its level would be that of no noise.
+        A sum that exceeds what the samples of this window allow is from noise that has ended; it gives no level.
         """
-        shown = unstated_input_noise(fitted.problem, fitted.window).tolist()
+        bounds = input_noise_bounds(fitted.problem, fitted.window).tolist()
         levels = list(fitted.problem.levels)
-        for at, (own, level) in enumerate(zip(self.sums, shown, strict=False)):
+        for at, (own, bound) in enumerate(zip(self.sums, bounds, strict=False)):
             noise = float(np.sqrt(own.observed / own.expected)) if own.deviate > SIGNIFICANT_SUM else np.inf
-            if noise < MIN_NOISE_FACTOR * level and self.windows >= MIN_SUMMED:
-                levels[at] = min(noise, level)
+            if noise < MIN_NOISE_FACTOR * bound and own.windows >= MIN_SUMMED:
+                levels[at] = min(noise, bound)
         return None if tuple(levels) == fitted.problem.levels else tuple(levels)
 
 
 def _limited(own: Correlation) -> Correlation:
     """Return the correlation of one window, observed no larger than if all that it has shown were noise."""
-    most = own.shown**2 * own.expected + SIGNIFICANT_SHARE * float(np.sqrt(own.variance))
+    most = own.bound**2 * own.expected + SIGNIFICANT_SHARE * float(np.sqrt(own.variance))
     return replace(own, observed=min(own.observed, most))
 
 
@@ -160,14 +160,15 @@ def _correlation(fit: FittedWindow, name: str, level: float, draws: int, random:
     fast = response(_fast(window, window.column(name)))
     fast -= basis @ (basis.T @ fast)
     power = float(fast @ fast)
-    if power < MIN_POWER:
+    if not MIN_POWER <= power < np.inf:  # false where the twin diverges
         return Correlation()
     expected = 0.0
     for noise in level * random.standard_normal((draws, window.records)):
         moved = response(noise)
         expected += float((moved - basis @ (basis.T @ moved)) @ response(_fast(window, noise)))
     observed, variance = float(fit.result.residuals @ fast), max(fit.cost, 1.0) ** 2 * power
-    return Correlation(observed, expected / draws / level**2, variance, level)
+    own = Correlation(observed, expected / draws / level**2, variance, level, 1)
+    return own if np.isfinite(expected) else Correlation()
 
 
 def _fast(window: Window, values: Array) -> Array:
@@ -187,9 +188,9 @@ def _response_to(fit: FittedWindow, name: str) -> Callable[[Array], Array]:
     def response(change: Array) -> Array:
         inputs = objective.excitation.inputs.copy()
         inputs[:, column] += change
-        moved = objective.kernel.simulate(
-            objective.parameters(guess), guess[:, objective.free :], replace(objective.excitation, inputs=inputs)
-        )
-        return np.asarray((objective.residuals(moved) - predicted).ravel())
+        excitation = replace(objective.excitation, inputs=inputs)
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = objective.kernel.simulate(objective.parameters(guess), guess[:, objective.free :], excitation)
+            return np.asarray((objective.residuals(moved) - predicted).ravel())
 
     return response

@@ -425,7 +425,7 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     Noise that was stated larger than it is hides structure, so likelier levels are searched at. But what the
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
-    quieter = likelier_levels_of(_fits(problem, windows)[-1])
+    quieter = likelier_levels_of(_fits(problem, windows[-1:])[0])
     pooled = _pooled(quieter, windows)
     at_positions = positions(problem.base_model)
     forms = [form for form in pooled_forms(pooled) if form.source in at_positions]

@@ -69,9 +69,9 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
 
 
 def periodic_errors(response: LinearResponse, beside: Iterable[Component], taken: Iterable[str]) -> list[Candidate]:
-    """Return for each component ``beside`` that is a sine of a place: that sine, as the error of a sensor.
+    """Return each component ``beside`` that is a sine of an angle or position, as the error of a sensor.
 
-    The sensor is that of the place or of its speed. Errors whose keys are ``taken`` are left out.
+    The sensor is that of its source or of the speed of it. Errors whose keys are ``taken`` are left out.
     """
     problem, twin, starts = response.problem, response.problem.base_model, dict[CandidateForm, list[float]]()
     source_names = [source.name for source in sources(twin)]

@@ -24,7 +24,7 @@ AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
-BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: with a value beyond it, no hypothesis is accepted
+BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no sensor, delay or component is accepted
 
 
 class WindowDecision(StrEnum):

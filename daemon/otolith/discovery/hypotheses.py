@@ -446,12 +446,12 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
 
 
 def describe_noise(problem: Problem) -> str:
-    """Return which sensors are noisier than stated, and which commands change between their samples."""
+    """Return which levels of noise are not as stated, and which commands change between their samples."""
     return "; ".join([*describe_levels(problem), *map(CHANGING.format, problem.changing)])
 
 
 def describe_levels(problem: Problem) -> list[str]:
-    """Return which sensors and states have other noise than stated, with the levels, one text each."""
+    """Return a text for each input, output and state whose noise is not as stated, with both levels."""
     twin = problem.base_model
     units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
     rows = [(f"{own} is less noisy than stated", f"{own} is noisier than stated", units[own]) for own in twin.signals]

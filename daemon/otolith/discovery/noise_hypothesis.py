@@ -78,18 +78,18 @@ def _at_larger_levels(around: Fit, null: Fit, max_deviance: float) -> Fit | None
     """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
     max_deviance += null.objective.innovation_model.log_determinant
-    unstated = unstated_input_noise(null.problem, null.window) > 0.0
+    unstated = input_noise_bounds(null.problem, null.window) > 0.0
     inputs = np.pad(unstated, (0, len(stated) - len(unstated)))
     there = replace(around, problem=null.problem).linearised_at_end()
-    trial = _at_likely_levels(there, inputs, max_deviance)
+    trial = _backward_elimination(there, inputs, max_deviance)
     if (np.array(trial.problem.levels) <= stated).all() or (np.array(trial.problem.noise) > useless).any():
         return None
-    scale = widening(null, trial)
-    prior = replace(null.prior, covariance=null.prior.covariance * np.outer(scale, scale))
+    inflation = prior_inflation(null, trial)
+    prior = replace(null.prior, covariance=null.prior.covariance * np.outer(inflation, inflation))
     return fit(trial.problem, null.window, prior, null.prior.mean, STEPS)
 
 
-def widening(null: Fit, trial: Fit) -> Array:
+def prior_inflation(null: Fit, trial: Fit) -> Array:
     """Return factors (2 free,) on the standard deviations of the prior of ``null``: earlier windows were as noisy.
 
     Each standard deviation grows by as much as that of the window alone grows with the noise of ``trial``. Trends
@@ -113,7 +113,7 @@ def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
     return FittedHypothesis(stated, fitted, normalisation(fitted, null.fit))
 
 
-def _at_likely_levels(stated: Fit, allowed: Mask, max_deviance: float = np.inf) -> Fit:
+def _backward_elimination(stated: Fit, allowed: Mask, max_deviance: float = np.inf) -> Fit:
     """Return the window linearised at likely levels where noise is stated, and of further ``allowed`` places (levels,).
 
     A level within ``MIN_NOISE_FACTOR`` of the stated one stays as it is, as does one without which the window is not
@@ -121,7 +121,7 @@ def _at_likely_levels(stated: Fit, allowed: Mask, max_deviance: float = np.inf) 
     deviance of at most ``max_deviance``, all stay as stated.
     """
     before, places = np.array(stated.problem.levels), np.arange(len(allowed))
-    trial = _most_likely(stated, (before > 0.0) | allowed)
+    trial = _maximise_likelihood(stated, (before > 0.0) | allowed)
     if _deviance(trial) > max_deviance:
         return stated
     ratios = np.array(trial.problem.levels) / np.where(before > 0.0, before, 1.0)
@@ -136,22 +136,22 @@ def _at_likely_levels(stated: Fit, allowed: Mask, max_deviance: float = np.inf) 
 
 def _with_levels_of(trial: Fit, stated: Fit, places: Mask) -> Fit:
     """Return the window at the most likely levels of ``places`` (levels,), searched from ``trial``, else as stated."""
-    return _most_likely(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
+    return _maximise_likelihood(_at(trial, np.where(places, trial.problem.levels, stated.problem.levels)), places)
 
 
-def unstated_input_noise(problem: Problem, window: Window) -> Array:
-    """Return the level (inputs,) that the samples of each input show where none is stated; zero elsewhere."""
+def input_noise_bounds(problem: Problem, window: Window) -> Array:
+    """Return upper bounds (inputs,) of the noise of inputs, from differences of samples; zero where one is stated."""
     stated = np.array(problem.levels[: len(problem.base_model.inputs)])
-    shown = np.array([_shown(source.name, window) for source in problem.base_model.inputs])
-    return np.where((stated == 0.0) & np.isfinite(shown), shown, 0.0)
+    bounds = np.array([_noise_bound(source.name, window) for source in problem.base_model.inputs])
+    return np.where((stated == 0.0) & np.isfinite(bounds), bounds, 0.0)
 
 
-def _shown(signal: str, window: Window) -> float:
+def _noise_bound(signal: str, window: Window) -> float:
     differences = np.abs(sample_differences(signal, window))
     return MAD_TO_SD * median(differences) if len(differences) else 0.0
 
 
-def _most_likely(trial: Fit, places: Mask) -> Fit:
+def _maximise_likelihood(trial: Fit, places: Mask) -> Fit:
     """Return the window linearised at the levels of ``places`` (levels,) that maximise the likelihood.
 
     Fisher scoring over variances (N. K. Gupta, R. K. Mehra, IEEE Transactions on Automatic Control 19, 1974). Slope and
@@ -196,7 +196,7 @@ def _limits(trial: Fit) -> tuple[Array, Array]:
         lowest[at] = stated[at] if is_coarse else max(lowest[at], min(step, stated[at]))
     highest = np.full(len(stated), np.inf)
     for at, source in enumerate(problem.base_model.inputs):
-        highest[at] = max(_shown(source.name, trial.window), stated[at])
+        highest[at] = max(_noise_bound(source.name, trial.window), stated[at])
     return lowest, highest
 
 
@@ -217,7 +217,9 @@ def likelier_levels_of(fitted: Fit) -> Problem:
     """
     if fitted.cost > EXPLAINED:
         return fitted.problem
-    likely = _at_likely_levels(fitted.linearised_at_end(), np.zeros(len(fitted.problem.levels), dtype=np.bool_)).problem
+    likely = _backward_elimination(
+        fitted.linearised_at_end(), np.zeros(len(fitted.problem.levels), dtype=np.bool_)
+    ).problem
     return likely if (np.array(likely.levels) <= fitted.problem.levels).all() else fitted.problem
 
 

@@ -171,7 +171,7 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
 
 
 def _periodic_errors(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
-    """Fit beside sines of a place the same errors of sensors: else only a force would be periodic."""
+    """Fit each sine of an angle or position also as the error of a sensor: else only a force would be periodic."""
     known, own = fitted[0].problem.components, screening.fitted
     limit = largest_chi_square(min(map(_chi_square, fitted)), own.count)
     near = [item for item in fitted if item.chi_square <= limit]
@@ -212,7 +212,7 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
 
 
 def _instead_of_components(item: FittedHypothesis, best: Fit) -> Proposal:
-    """Propose ``item`` from parameters that have the effect of what ``best`` has in addition, to first order.
+    """Propose ``item`` from parameters with the effect, to first order, of the components that only ``best`` has.
 
     At the values of ``best`` alone, a fit would start at the parameters before they moved.
     """

@@ -419,10 +419,10 @@ def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:
 def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
     """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
 
-    Their misfits are at most ``DECISIVE`` above the least. If only its fewer values make another one the best, the
-    data do not decide for it either. The best of each group comes first. A component is in a group only if nothing with
-    fewer values explains the windows as well. Otherwise its deviance decides, with the complexity penalty. The null
-    hypothesis is contained in all others, so it is in no group.
+    Their misfits are at most ``DECISIVE`` above the least. The hypothesis of least deviance belongs to them even if its
+    misfit is larger: then only its fewer values make it the best. The best of each group comes first. A component is in
+    a group only if nothing with fewer values explains the windows as well. Otherwise its deviance decides, with the
+    complexity penalty. The null hypothesis is contained in all others, so it is in no group.
     """
     others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
     least = min((hypotheses[at].misfit for at in others), default=0.0)

@@ -166,9 +166,12 @@ class Posterior:
         belief = imm_filter.set_all_modes(self.belief, prior.mean / size, prior.covariance / np.outer(size, size))
         return replace(self, belief=belief)
 
-    def with_noise(self, problem: Problem, widening: Array) -> "Posterior":
-        """Return the same for a ``problem`` with other noise; standard deviations grow by factors (2 free,)."""
-        covariance = self.belief.covariance * np.outer(widening, widening)
+    def with_noise(self, problem: Problem, inflation: Array) -> "Posterior":
+        """Return the same for a ``problem`` with other noise; standard deviations grow by factors (2 free,).
+
+        The variance ratio is one: the noise explains what windows disagreed in.
+        """
+        covariance = self.belief.covariance * np.outer(inflation, inflation)
         return replace(self, problem=problem, belief=replace(self.belief, covariance=covariance, variance_ratio=1.0))
 
     def reset_value(self, index: int, value: float, sd: float) -> "Posterior":

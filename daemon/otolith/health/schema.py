@@ -14,7 +14,7 @@ from otolith.discovery.decision import Approval, WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
 from otolith.health.limits import Level
-from otolith_drivers.config_files import ClosedModel
+from otolith_drivers.config_files import DocumentModel
 
 Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -48,7 +48,7 @@ class ComponentStatus(StrEnum):
     FADING = "fading"  # It is hardly significant any more
 
 
-class NumberDocument(ClosedModel):
+class NumberDocument(DocumentModel):
     """One value of a component, with its 95 % interval."""
 
     value: float
@@ -58,7 +58,7 @@ class NumberDocument(ClosedModel):
     unit: str
 
 
-class AlternativeDocument(ClosedModel):
+class AlternativeDocument(DocumentModel):
     """A hypothesis, and how probable it is."""
 
     reason: FaultType
@@ -66,7 +66,7 @@ class AlternativeDocument(ClosedModel):
     probability: float
 
 
-class ComponentDocument(ClosedModel):
+class ComponentDocument(DocumentModel):
     """A component that was added to the twin."""
 
     id: str  # Site, family and input: the same from adoption to the end
@@ -93,7 +93,7 @@ class Severity(StrEnum):
     FAULT = "fault"
 
 
-class FindingDocument(ClosedModel):
+class FindingDocument(DocumentModel):
     """A finding for the operator."""
 
     id: str
@@ -115,7 +115,7 @@ class EventChange(StrEnum):
     CLEARED = "cleared"
 
 
-class EvidenceDocument(ClosedModel):
+class EvidenceDocument(DocumentModel):
     """What an event rests on."""
 
     windows: tuple[int, int]  # Index of the first and of the latest window that showed it
@@ -126,7 +126,7 @@ class EvidenceDocument(ClosedModel):
     probability: float | None = None  # That the true value is beyond the limit
 
 
-class EventDocument(ClosedModel):
+class EventDocument(DocumentModel):
     """A condition of a part that calls for attention, from the window that raised it to the one that cleared it."""
 
     id: str  # What it is about, and when it began: the same in each of its reports
@@ -153,7 +153,7 @@ class EventDocument(ClosedModel):
         return self.state is Level.ACT and self.end is None
 
 
-class PartDocument(ClosedModel):
+class PartDocument(DocumentModel):
     """State of a part or of the machine."""
 
     state: Level
@@ -184,7 +184,7 @@ class Status(StrEnum):
     """The windows contradict the twin or the bounds, how is in the reason; the value is the last that did not."""
 
 
-class QualityDocument(ClosedModel):
+class QualityDocument(DocumentModel):
     """Sampling quality of a window."""
 
     verdict: Verdict
@@ -195,7 +195,7 @@ class QualityDocument(ClosedModel):
     reasons: tuple[str, ...] = ()
 
 
-class WindowDocument(ClosedModel):
+class WindowDocument(DocumentModel):
     """The window; start and end in Unix seconds."""
 
     index: int
@@ -207,7 +207,7 @@ class WindowDocument(ClosedModel):
     absent: dict[str, str] | None = None  # Of several sources, those that are down or gave no sample: in words, by name
 
 
-class CrossingDocument(ClosedModel):
+class CrossingDocument(DocumentModel):
     """When a parameter will pass a limit, Unix seconds."""
 
     limit: float  # In the unit of the parameter
@@ -216,7 +216,7 @@ class CrossingDocument(ClosedModel):
     high: float | None = None  # None if it lies beyond ten times the length of the history
 
 
-class ForecastDocument(ClosedModel):
+class ForecastDocument(DocumentModel):
     """Whether and when a parameter will pass its limits, from its history."""
 
     computed: float  # Unix seconds
@@ -226,7 +226,7 @@ class ForecastDocument(ClosedModel):
     reason: str = ""  # Why there is no forecast
 
 
-class ParameterDocument(ClosedModel):
+class ParameterDocument(DocumentModel):
     """One parameter: value, unit, uncertainty, status, reason."""
 
     value: float | None = None
@@ -250,7 +250,7 @@ class ParameterDocument(ClosedModel):
     advice: str | None = None  # The experiment that would determine the parameter, if this window did not
 
 
-class FitDocument(ClosedModel):
+class FitDocument(DocumentModel):
     """How well the twin explains the window; root mean square errors per output, in the output's unit."""
 
     rmse_configured: dict[str, float]
@@ -262,7 +262,7 @@ class FitDocument(ClosedModel):
     outcome: Outcome  # How the search ended
 
 
-class CostDocument(ClosedModel):
+class CostDocument(DocumentModel):
     """Computing effort of a report."""
 
     seconds: float | None = None  # Computing time, s; None in a replay, unless it was asked for
@@ -272,7 +272,7 @@ class CostDocument(ClosedModel):
     searched: bool = False  # Whether hypotheses were compared: components, moved parameters, faulty sensors
 
 
-class SourceDocument(ClosedModel):
+class SourceDocument(DocumentModel):
     """State of one of several sources of a machine."""
 
     signals: tuple[str, ...]
@@ -285,7 +285,7 @@ class SourceDocument(ClosedModel):
     reconnects: int = 0
 
 
-class DriverDocument(ClosedModel):
+class DriverDocument(DocumentModel):
     """State of the connection to the machine."""
 
     up: bool
@@ -295,7 +295,7 @@ class DriverDocument(ClosedModel):
     sources: dict[str, SourceDocument] = Field(default_factory=dict)  # By name; the connection is up while any is
 
 
-class CountersDocument(ClosedModel):
+class CountersDocument(DocumentModel):
     """What was received and lost since the daemon started."""
 
     received: int = 0  # Samples
@@ -313,7 +313,7 @@ class CountersDocument(ClosedModel):
     commands_failed: int = 0  # Events for which on_event failed
 
 
-class ReportDocument(ClosedModel):
+class ReportDocument(DocumentModel):
     """The report of one window."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA

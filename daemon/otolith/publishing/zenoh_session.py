@@ -27,7 +27,7 @@ from otolith.publishing.zenoh_config import (
     raise_descriptor_limit,
 )
 from otolith.storage.history_writer import HistoryWriter
-from otolith_drivers.config_files import ClosedModel
+from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import ServiceError
 
 log = logging.getLogger(__name__)
@@ -228,7 +228,7 @@ class Publisher:
         with self._lock:
             self._latest = text
         self._reports.put(text)
-        others: list[tuple[str, ClosedModel]] = [
+        others: list[tuple[str, DocumentModel]] = [
             (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
         ]
         others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]

@@ -91,7 +91,7 @@ class ChildProcess:
         self._restart_at, self._started_at = None, time.monotonic()
         try:
             self._spawn(arguments)
-        except OSError as error:  # out of file descriptors, processes or memory: may be temporary
+        except (OSError, RuntimeError) as error:  # out of descriptors, processes, threads or memory: may be temporary
             log.warning("process %s cannot be started: %s", self.name, error)
             self._release()
 
@@ -104,14 +104,13 @@ class ChildProcess:
                 target=_run_main, args=(theirs, self._main, arguments), name=self.name, daemon=True
             )
             resource_tracker.ensure_running()  # its start unblocks signals, so it must be running before the block
+            # Its own descriptor for the thread: the next pipe gets the number, and the write, of one that is closed.
+            sending = self._outbox, multiprocessing.connection.Connection(os.dup(self._connection.fileno()))
             # Child and thread inherit the mask: only the main thread handles a signal to the whole process group.
             unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
                 process.start()
                 self._process = process
-                # A descriptor that only the thread closes: the next pipe gets the number of a closed one, and a write
-                # that had begun would reach the next process.
-                sending = self._outbox, multiprocessing.connection.Connection(os.dup(self._connection.fileno()))
                 threading.Thread(target=_send_queued, args=sending, name=f"to-{self.name}", daemon=True).start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)

@@ -217,7 +217,7 @@ class ComponentSource:
 
 @lru_cache(maxsize=64)
 def sites(base: Definition) -> tuple[Site, ...]:
-    """The author's sites, one for the error of each sensor, outputs, then inputs, and those of :func:`gain_site`."""
+    """Return the author's sites, then those of the errors of outputs, inputs, and gains of measured speeds."""
     names = [*(output.name for output in base.outputs), *(driven.name for driven in base.inputs)]
     sensors, gains = [(name, sensor_site(name)) for name in names], dict.fromkeys(measured_speeds(base).values())
     return (
