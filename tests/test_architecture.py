@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
-# History, security, recordings, several sources, pooled windows, own rules: beyond it something must be replaced.
+# History, security, several sources, pooled windows, own rules, noise of inputs: beyond it something must be replaced.
 MAX_SOURCE_LINES = 33_950
 MAX_MODULES = 152  # in daemon and drivers: 131 and the 21 __init__ files
 MAX_MODULES_IN_A_FOLDER = 12
