@@ -16,9 +16,6 @@ ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
-# History, security, several sources, pooled windows, own rules, noise of inputs: beyond it something must be replaced.
-MAX_SOURCE_LINES = 33_950
-MAX_MODULES = 152  # in daemon and drivers: 131 and the 21 __init__ files
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 12
 
@@ -31,18 +28,6 @@ BREACHES = {
     "the twin imports the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
     "acquisition imports publishing": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),
 }
-# Words that name nothing, and names that are not the field's terms.
-BANNED = frozenset({
-    *("found", "told", "said", "heard", "lived", "entry"),
-    *("heart", "Lesson", "TEACHING", "untaught", "Standing", "Fused", "Belief", "AGITATIONS", "carried", "rebased"),
-    *("pinned", "surprise_of", "contradicted", "foretold", "vague", "Informed", "Polished", "quantum", "HOPELESS"),
-    *("glance", "Glance", "Claim", "Explanation", "Told", "Heard", "Wanted", "odds", "occam", "landscape", "Landscape"),
-    *("Gains", "holding", "deactivation", "with_content", "catalogue", "Turned", "moved_on", "outlived", "FADED_UNDER"),
-    *("roughness", "Ladder", "fewest", "likeliest", "Sight", "unlikelihood", "agreement", "liveliest", "Companion"),
-    *("companion", "has_thrived", "housekeeper", "Housekeeper", "Keeper", "tally", "Tally", "Board", "crew", "outlets"),
-    *("vigilance", "Pace", "spoiled", "complaints", "Rest", "Asker", "beat", "freshness", "stretch", "heading"),
-    *("Interference", "Tick", "Closed", "Page", "fitted_to", "lesson", "scatter"),
-})  # fmt: skip
 
 
 def lint(folder: Path) -> "subprocess.CompletedProcess[str]":
@@ -78,33 +63,15 @@ def test_the_import_contract_has_few_layers() -> None:
     assert len(layers) <= MAX_LAYERS
 
 
-def test_there_are_few_modules() -> None:
-    assert len(SOURCES) <= MAX_MODULES
+def test_a_folder_has_a_dozen_modules_at_most() -> None:
     folders = Counter(path.parent for path in SOURCES if path.name != "__init__.py")
     assert {folder.name: count for folder, count in folders.items() if count > MAX_MODULES_IN_A_FOLDER} == {}
-
-
-def test_the_source_stays_small() -> None:
-    lines = [line for path in SOURCES for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    assert len(lines) <= MAX_SOURCE_LINES
 
 
 @pytest.mark.parametrize("root", ["daemon", "drivers", "tests", "benchmarks"])
 def test_no_file_is_longer_than_one_idea(root: str) -> None:
     lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in (ROOT / root).rglob("*.py")}
     assert {name: length for name, length in lengths.items() if length > MAX_FILE_LINES} == {}
-
-
-def identifiers(path: Path) -> Iterator[str]:
-    """Names, attributes, arguments, keywords, functions and classes of a file."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = (getattr(node, field, None) for field in ("id", "attr", "arg", "name", "asname"))
-        yield from (name.lstrip("_") for name in names if isinstance(name, str))
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_no_banned_name_is_used(path: Path) -> None:
-    assert set(identifiers(path)) & BANNED == set()
 
 
 def test_no_class_name_is_used_twice() -> None:
