@@ -1,8 +1,7 @@
 """``otolith replay``: the same reports as the daemon, byte for byte; unusable files are refused.
 
-A golden case is a folder with ``data.*`` and ``error.txt``, where ``{file}`` stands for the data and ``{machine}`` for
-the machine file: its own, or the one that all cases without share.
-``OTOLITH_UPDATE_GOLDEN=1 make test`` rewrites the messages: check the difference.
+A golden case is a folder with ``data.*`` and a list of what its error contains, where ``{file}`` stands for the data
+and ``{machine}`` for the machine file: its own, or the one that all cases without share.
 """
 
 import ast
@@ -44,6 +43,7 @@ from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import frames_of, live
 from tests.drivers.logs import written as written_log
 from tests.machine.test_machine_file import GOLDEN as MACHINE_FILES
+from tests.messages import assert_says_what_is_listed
 from tests.waiting import PATIENCE
 
 CASES = sorted(path.parent for path in GOLDEN.glob("*/data.*"))
@@ -55,15 +55,13 @@ def rows(scenario: MotorScenario) -> Lines:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_an_unusable_file_gets_its_error_message(case: Path) -> None:
+def test_an_unusable_file_gets_its_error(case: Path) -> None:
     (data,) = case.glob("data.*")
     machine = case / "machine.toml" if (case / "machine.toml").exists() else MACHINE
     with pytest.raises(ConfigurationError) as caught:
         replay(machine, [data], None, as_json=True, stopped=lambda: False)
-    message = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
-    if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
-        (case / "error.txt").write_text(message, encoding="utf-8")
-    assert message == (case / "error.txt").read_text(encoding="utf-8")
+    message = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}")
+    assert_says_what_is_listed(message, case)
 
 
 def test_a_binary_or_missing_file_is_refused(tmp_path: Path) -> None:
