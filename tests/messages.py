@@ -16,3 +16,9 @@ def assert_says_what_is_listed(message: str, case: Path) -> None:
     parts = (case / LISTED).read_text(encoding="utf-8").splitlines()
     assert parts
     assert_says(message, *parts)
+
+
+def assert_refuses(error: Exception, file: Path | str) -> None:
+    """Assert that each line names ``file`` and a reason."""
+    lines = str(error).split("\n")
+    assert all(line.startswith(str(file)) and len(line.removeprefix(str(file)).split()) > 1 for line in lines), lines

@@ -17,6 +17,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import tables as table
 from tests.cli.replays import HEADING, MACHINE, PERIOD, Lines, recorded, reports, summed_up, values, written
 from tests.conftest import SIGNALS
+from tests.messages import assert_refuses
 
 
 @pytest.fixture
@@ -255,17 +256,16 @@ def test_table_of_random_cells_is_refused_or_read(
     tmp_path: Path, rows: list[tuple[float, list[str]]], ordered: bool, pace: float
 ) -> None:
     lines = [[repr(time * pace), *cells] for time, cells in (sorted(rows) if ordered else rows)]
-    check_any(written(tmp_path, lines, separator=";"))
+    check_any(written(tmp_path, lines, separator=";"), len(lines))
 
 
-def check_any(path: Path) -> None:
-    """Refused with its name, or every window gets its report."""
+def check_any(path: Path, rows: int = 0) -> None:
+    """Refused with a reason, or every window gets its report, and each of ``rows`` that is not used is counted."""
     machine = path.with_name("machine.toml")
     window = '[window]\nlength = "0.2 s"\nmissing_limit = "100 %"\ngap_limit = "1 s"\njitter_limit = "1 s"\n'
     swarm = "[swarm]\ngenerations = 2\nsize = 3\n"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + window + swarm, encoding="utf-8")
     plan = load_machine(machine, with_driver=False)
-    message = str(path)
     try:
         with table.TableReader(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
             for index, report in enumerate(Replay(plan, opened).reports()):
@@ -274,6 +274,8 @@ def check_any(path: Path) -> None:
                 assert document.counters is not None
                 assert document.counters.windows_missed == 0
                 assert ReportDocument.from_json(document.to_json()) == document
+        counts = opened.counts
+        assert counts.rows + counts.bad_rows == rows or not rows
+        assert bool(counts.bad_rows + counts.bad_cells) == (counts.first_bad is not None)
     except OtolithError as error:
-        message = str(error)
-    assert str(path) in message
+        assert_refuses(error, path)

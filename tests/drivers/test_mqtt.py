@@ -237,8 +237,11 @@ def test_what_a_message_lacks_is_named() -> None:
 @given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode) | st.just(b"[" * 50_000) | st.just(b"1" * 5000))
 def test_no_message_raises(payload: bytes) -> None:
     read = messages(time="t")
-    read.take("motor", payload, 1.0, retained=False)
-    assert read.bad <= 2
+    samples = read.take("motor", payload, 1.0, retained=False)
+    usable = sum(math.isfinite(sample.value) for sample in samples)
+    assert usable == read.received
+    assert usable + min(read.bad, 1) == 1
+    assert bool(read.topics["motor"].unusable.text) == bool(read.bad)
 
 
 def test_a_huge_message_is_refused() -> None:
@@ -254,8 +257,10 @@ def test_a_huge_message_is_refused() -> None:
     )
 )
 def test_no_value_in_a_message_raises(value: Any) -> None:
-    (sample,) = messages().take("motor", document(value), 1.0, retained=False)
+    read = messages()
+    (sample,) = read.take("motor", document(value), 1.0, retained=False)
     assert math.isnan(sample.value) or isinstance(value, bool | int | float | str)
+    assert read.bad == math.isnan(sample.value)
 
 
 def test_paths_reach_into_lists() -> None:

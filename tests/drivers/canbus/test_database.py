@@ -13,6 +13,7 @@ from otolith_drivers.canbus.options import CanSource, request_from_databases
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import dbc, decoder, frame, values
+from tests.messages import assert_refuses
 from tests.waiting import within
 
 DBC = EXAMPLES / "dc-motor.dbc"
@@ -278,6 +279,7 @@ def test_mutated_databases_are_read_or_refused_in_one_line(
     try:
         frame_decoder = decoder(tmp_path, {"omega": ("rad/s", {"signal": wish})}, mutated, suffix)
     except ConfigurationError as error:
+        assert_refuses(error, "")
         assert "\n" not in str(error)  # noqa: PT017 - both outcomes are allowed
         return
     for identifier, extended in frame_decoder.identifiers():

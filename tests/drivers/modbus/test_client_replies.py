@@ -15,6 +15,7 @@ from otolith_drivers.modbus.driver import Options
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import TIMEOUT, TWO, Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.messages import assert_refuses
 from tests.waiting import wait_for
 
 
@@ -124,7 +125,8 @@ def test_any_bytes_are_valid_registers_or_an_error(
     behaviour.corrupt = corrupt
     try:
         registers = client.read(1, "holding", 0, 4)
-    except (NoReplyError, ExceptionReplyError, ConnectionLostError):
+    except (NoReplyError, ExceptionReplyError, ConnectionLostError) as error:
+        assert_refuses(error, "")
         return
     finally:
         client.close()
