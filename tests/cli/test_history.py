@@ -132,6 +132,15 @@ def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter, 
     assert error.filename == str(path)
 
 
+def test_a_history_that_was_set_aside_is_opened_by_its_path(written: HistoryWriter) -> None:
+    written._close()
+    kept = written.reader.path.with_name(f"{SITE}.{MACHINE}.20260131T101112000000.kept.sqlite")
+    written.reader.path.rename(kept)
+    assert "raised: WATCH: winding" in run(str(kept)).stdout
+    rows = json.loads(run(str(kept), "--json").stdout)
+    assert (rows["site"], rows["machine"]) == (SITE, MACHINE)
+
+
 def test_events_alone(written: HistoryWriter) -> None:
     del written
     rows = list(csv.DictReader(run(MACHINE, "--events", "--csv").stdout.splitlines()))

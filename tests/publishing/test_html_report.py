@@ -228,7 +228,7 @@ def test_marks_of_time_are_few_and_at_round_times(span: float) -> None:
 def test_a_history_of_an_earlier_version_has_no_lanes_but_is_shown() -> None:
     reader = written(reports(20))
     with sqlite3.connect(reader.path) as connection:
-        connection.executescript("DROP TABLE state; DROP TABLE description")
+        connection.executescript("DROP TABLE state; DROP TABLE description; PRAGMA user_version = 1")
     text = page(reader, now=START + 40.0).text
     assert "OK since" in text
     assert "The history has none: otolith twin show dc_motor" in text

@@ -7,6 +7,7 @@ shows. Times are Unix seconds. Positions are in percent of a plot, from its left
 import math
 import re
 import time
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import Texts, texts_in
-from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
+from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
 from otolith_drivers.units import equation_text, formula_text
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
@@ -119,7 +120,7 @@ def html_report(
     rows = [row for row in samples if since - length < row.time <= now + DAY]
     silence = now - latest.window.end if latest else 0.0
     is_silent = latest is None or silence > SILENT_WINDOWS * (latest.window.end - latest.window.start)
-    begins = [row.time for row in rows[:1]] + [begin for _, begin, _ in states[:1]]
+    begins = [row.time for row in rows[:1]] + [row.entered for row in states[:1]]
     begin = max(since, min([*begins, latest.window.start if latest else since]))
     until = latest.window.end if latest and not is_silent and silence > -DAY else now
     axis = _axis(min(begin, until - 1.0), until, latest)
@@ -184,15 +185,30 @@ def _events(
 
 
 def _lanes(
-    axis: Axis, latest: ReportDocument | None, states: Sequence[tuple[str, float, Level]]
+    axis: Axis, latest: ReportDocument | None, states: Sequence[PartState]
 ) -> Iterator[tuple[str, Level, list[tuple[Level, float, float, float, float]]]]:
     """Yield each part with its present state, and its states with position, length, begin and end."""
     health = latest.health if latest else None
     for part, present in ({"": health, **health.parts} if health else {}).items():
-        changes = [(begin, state) for name, begin, state in states if name == part]
-        changes = [*(changes or [(present.since, present.state)]), (axis.now, present.state)]
+        own = [(row.entered, row.state) for row in states if row.part == part]
         yield part, present.state, [(state, *axis.span(begin, end), begin, end)
-                                    for (begin, state), (end, _) in pairwise(changes) if end > axis.begin]  # fmt: skip
+                                    for begin, end, state in _pieces(own or [(present.since, present.state)], axis.now)
+                                    if end > axis.begin]  # fmt: skip
+
+
+def _pieces(entered: Sequence[tuple[float, Level]], now: float) -> Iterator[tuple[float, float, Level]]:
+    """Yield begin, end and state from when each was entered, in this order, to when the next one was.
+
+    A state does not begin with its cause, which may be older. Where the clock was set meanwhile, a state is shown only
+    as long as it is known.
+    """
+    times = sorted(begin for begin, _ in entered)
+    ends = (*(begin for begin, _ in entered[1:]), now)
+    for (begin, state), following in zip(entered, ends, strict=True):
+        later = bisect_right(times, begin)
+        end = min((following, *times[later : later + 1]))
+        if begin < end:
+            yield begin, end, state
 
 
 def _curves(

@@ -10,14 +10,15 @@ import json
 import logging
 import sqlite3
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.limits import Level
-from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, ReportDocument
+from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, PartDocument, ReportDocument
+from otolith.storage.history_schema import check, upgrade
 from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.user_dirs import state_directory
@@ -26,41 +27,17 @@ Content = TypeVar("Content")
 
 log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 1
-APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
 SUFFIX = ".history.sqlite"
+KEPT = ".kept.sqlite"  # of one that was set aside
 WINDOW, MINUTE, HOUR, DAY = 0, 60, 3600, 86_400
 RESOLUTIONS = {WINDOW: "window", MINUTE: "minute", HOUR: "hour", DAY: "day"}
 """Seconds of an interval, and its name; 0 for the windows themselves."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 BUSY_TIMEOUT = 2.0  # s to wait for another process that reads or writes
-PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
 CHECKPOINT_BYTES = 1 << 20  # of the write-ahead log, after which it is merged
 COMPRESSION = 1  # level of zlib
 FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
 
-_SCHEMA = """
-CREATE TABLE identity (site TEXT NOT NULL, machine TEXT NOT NULL);
-CREATE TABLE series (id INTEGER PRIMARY KEY, name TEXT NOT NULL, unit TEXT NOT NULL, UNIQUE (name, unit));
-CREATE TABLE sample (
-    resolution INTEGER NOT NULL, time REAL NOT NULL, series INTEGER NOT NULL, count INTEGER NOT NULL,
-    min REAL NOT NULL, mean REAL NOT NULL, max REAL NOT NULL, last REAL NOT NULL, low REAL, high REAL,
-    status TEXT NOT NULL, PRIMARY KEY (resolution, time, series)) WITHOUT ROWID;
-CREATE TABLE report (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text BLOB NOT NULL);
-CREATE TABLE event (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text TEXT NOT NULL);
-CREATE TABLE finding (
-    id TEXT NOT NULL, first REAL NOT NULL, last REAL NOT NULL, count INTEGER NOT NULL, text TEXT NOT NULL,
-    PRIMARY KEY (id, first)) WITHOUT ROWID;
-CREATE TABLE counters (hour REAL NOT NULL, run INTEGER NOT NULL, text TEXT NOT NULL, PRIMARY KEY (hour, run));
-CREATE TABLE clock (retention REAL NOT NULL, waited REAL NOT NULL);
-CREATE TABLE start (sequence INTEGER NOT NULL);
-"""
-# Added by each writer: a database that an earlier version wrote last lacks them.
-_LATER_SCHEMA = """
-CREATE TABLE IF NOT EXISTS state (
-    part TEXT NOT NULL, since REAL NOT NULL, state TEXT NOT NULL, PRIMARY KEY (part, since)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS description (text TEXT NOT NULL);
-"""
 _SAMPLE = """
 INSERT INTO sample VALUES (?, ?, ?, 1, ?4, ?4, ?4, ?4, ?5, ?6, ?7) ON CONFLICT DO UPDATE SET
     count = count + 1, min = min(min, excluded.min), mean = mean + (excluded.mean - mean) / (count + 1),
@@ -86,6 +63,16 @@ class HistorySample:
     status: str  # Of the last window; of a component adopted or fading
 
 
+@dataclass(frozen=True, slots=True)
+class PartState:
+    """A state of a part, or of the machine."""
+
+    part: str  # Empty for the machine
+    entered: float  # End of the window that showed it first, Unix s: it was announced from then on
+    since: float  # Begin of its cause, which may be long before
+    state: Level
+
+
 def history_directory() -> Path:
     """Return the folder of the databases; raise ServiceError if there is no home directory."""
     return state_directory() / "history"
@@ -94,36 +81,6 @@ def history_directory() -> Path:
 def history_path(site: str, machine: str) -> Path:
     """Return the path of a machine's database; raises as :func:`history_directory`."""
     return history_directory() / f"{site}.{machine}{SUFFIX}"
-
-
-def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
-    """Make an empty database a history."""
-    connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
-    connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
-    with connection:
-        connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
-
-
-def check(connection: sqlite3.Connection, site: str, machine: str) -> None:
-    """Check that an open database is the history of this machine.
-
-    Raises:
-        ValueError: it is not, or another version wrote it.
-        sqlite3.Error: it is damaged or cannot be read.
-    """
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if application != APPLICATION_ID:
-        raise ValueError("it is no history of Otolith")
-    if version != SCHEMA_VERSION:
-        raise ValueError(f"version {version} of the format: this Otolith reads {SCHEMA_VERSION}")
-    identities = connection.execute("SELECT site, machine FROM identity").fetchall()
-    if identities != [(site, machine)]:
-        other = ", ".join(f"{name} at {place}" for place, name in identities) or "no machine"
-        raise ValueError(f"it is of {other}")
 
 
 def describe_machine(twin: Definition, plan: MonitoringPlan) -> str:
@@ -145,7 +102,8 @@ class Tables:
         self._connection, self._run = connection, run
         self._series: dict[tuple[str, str], int] = {}
         self._description = ""
-        connection.executescript(_LATER_SCHEMA)
+        self._states: dict[str, tuple[str, float, int]] = {}
+        """The last state of each part as it is written: with the begin of its cause, and its sequence number."""
 
     def describe(self, text: str) -> None:
         """Write the description of the machine, as :func:`describe_machine` returns it, if it has changed."""
@@ -164,8 +122,7 @@ class Tables:
         for component in document.components:
             self._add_value(component.id, end, component.values["amplitude"], component.status)
         if (health := document.health) is not None:
-            states = [(name, part.since, part.state) for name, part in {"": health, **health.parts}.items()]
-            self._connection.executemany("INSERT OR IGNORE INTO state VALUES (?, ?, ?)", states)
+            self._add_states({"": health, **health.parts}, document.sequence or 0, end)
         for event in document.events:
             if event.change is not None:
                 row = (event.sequence, end, event.model_dump_json(exclude_none=True))
@@ -186,7 +143,27 @@ class Tables:
     def forget_series(self) -> None:
         """Read the numbers of the series again: a transaction that added some was rolled back."""
         self._series.clear()
+        self._states.clear()
         self._description = ""
+
+    def _add_states(self, parts: Mapping[str, PartDocument], sequence: int, end: float) -> None:
+        """Write the states that were entered at ``end``; a part that the report does not name any more is at OK."""
+        if not self._states:
+            query = "SELECT part, state, since, max(sequence) FROM state GROUP BY part"
+            self._states = {part: tuple(rest) for part, *rest in self._connection.execute(query)}
+        shown: dict[str, tuple[str, float]] = {part: (item.state, item.since) for part, item in parts.items()}
+        for part in self._states.keys() - shown.keys():
+            shown[part] = Level.OK, end
+        for part, (state, since) in shown.items():
+            before = self._states.get(part)
+            if before is None or before[0] != state:
+                values = part, sequence, end, since, state
+                self._connection.execute("INSERT OR REPLACE INTO state VALUES (?, ?, ?, ?, ?)", values)
+                self._states[part] = state, since, sequence
+            elif since < before[1]:
+                query = "UPDATE state SET since = ? WHERE part = ? AND sequence = ?"
+                self._connection.execute(query, (since, part, before[2]))
+                self._states[part] = state, since, before[2]
 
     def _add_value(self, name: str, end: float, item: ParameterDocument | NumberDocument, status: str) -> None:
         if item.value is None:
@@ -215,6 +192,15 @@ class HistoryReader:
         """``path`` as :func:`history_path` returns it."""
         self.path = path
         self.site, _, self.machine = path.name.removesuffix(SUFFIX).partition(".")
+
+    @classmethod
+    def of_file(cls, path: Path) -> "HistoryReader":
+        """Return the reader of a file of any name, as of one that was set aside; raises as :meth:`names`."""
+        reader = cls(path)
+        with reader._checked() as (connection, identity):
+            del connection
+            reader.site, reader.machine = identity
+        return reader
 
     def names(self) -> list[str]:
         """Return the names of all series; these and the following methods raise ConfigurationError.
@@ -263,16 +249,19 @@ class HistoryReader:
         rows = self._rows("SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
         return self._undamaged(rows, lambda hour, run, text: {"hour": hour, "run": run, **json.loads(text)})
 
-    def states(self, since: float) -> list[tuple[str, float, Level]]:
-        """Return part, begin and state of each change of a state, from the one at ``since`` on; the machine is ''."""
-        before = "(SELECT max(since) FROM state AS other WHERE other.part = state.part AND since <= ?1)"
-        query = f"SELECT * FROM state WHERE since >= coalesce({before}, ?1) ORDER BY since"  # noqa: S608 - our own text
-        rows = self._later_rows("state", query, since)
-        return self._undamaged(rows, lambda part, begin, state: (part, begin, Level(state)))
+    def states(self, since: float) -> list[PartState]:
+        """Return the states of the parts in the order in which they were entered, from those at ``since`` on."""
+        before = "SELECT part, max(sequence) AS first FROM state WHERE entered <= ? GROUP BY part"
+        query = (
+            f"SELECT part, entered, since, state FROM state LEFT JOIN ({before}) USING (part) "  # noqa: S608 - our own text
+            "WHERE sequence >= coalesce(first, sequence) ORDER BY sequence"
+        )
+        rows = self._rows(query, since)
+        return self._undamaged(rows, lambda part, entered, since, state: PartState(part, entered, since, Level(state)))
 
     def description(self) -> dict[str, Any]:
         """Return what :func:`describe_machine` wrote; empty if nobody did."""
-        rows = self._later_rows("description", "SELECT text FROM description")
+        rows = self._rows("SELECT text FROM description")
         return next(iter(self._undamaged(rows, lambda text: dict(json.loads(text)))), {})
 
     def latest(self, count: int) -> list[ReportDocument]:
@@ -310,18 +299,22 @@ class HistoryReader:
             log.warning("%s: %d rows that the disk has damaged are left out", self.path, damaged)
         return contents
 
-    def _later_rows(self, table: str, query: str, *values: object) -> list[tuple[Any, ...]]:
-        """Return the rows of a table that a database of an earlier version may lack; then there are none."""
-        exists = self._rows("SELECT 1 FROM sqlite_master WHERE name = ?", table)
-        return self._rows(query, *values) if exists else []
-
     def _rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
+        with self._checked() as (connection, identity):
+            if identity != (self.site, self.machine):
+                raise ValueError(f"it is of {identity[1]} at {identity[0]}")
+            return connection.execute(query, values).fetchall()
+
+    @contextlib.contextmanager
+    def _checked(self) -> Iterator[tuple[sqlite3.Connection, tuple[str, str]]]:
+        """Open for reading as a database of the present version, with its site and machine."""
         if not self.path.is_file():  # a pipe would not return
             raise ConfigurationError(f"{self.path}: no such file; 'otolith run' makes the history of a machine")
         try:
             with self._opened() as connection:
-                check(connection, self.site, self.machine)
-                return connection.execute(query, values).fetchall()
+                identity = check(connection)
+                upgrade(connection, "temp")
+                yield connection, identity
         except (sqlite3.Error, ValueError) as error:
             raise ConfigurationError(f"{self.path}: cannot be read: {error}") from error
 

@@ -25,20 +25,19 @@ from otolith.storage.history import (
     CHECKPOINT_BYTES,
     DAY,
     HOUR,
+    KEPT,
     MINUTE,
     WINDOW,
     HistoryReader,
     Tables,
-    check,
-    create,
     history_path,
 )
+from otolith.storage.history_schema import NewerVersionError, check, create, upgrade
 from otolith.storage.recording_files import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP
 from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
 
-KEPT = ".kept.sqlite"
 DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 """Primary codes of a database that cannot be used as it is; most others are faults of disk and permissions."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
@@ -52,6 +51,7 @@ AGES = {WINDOW: 1.0 * DAY, MINUTE: 14.0 * DAY, HOUR: 366.0 * DAY}  # s; of days,
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
 MIN_REPORTS = 1800  # that are kept before coarser values go
 CHUNK = 1000  # rows of a table in one transaction
+LAST_STATE = "SELECT max(sequence) FROM state AS other WHERE other.part = state.part"  # It is never deleted
 PAGES_AT_ONCE = 1000  # that are given back to the file system in one transaction
 
 
@@ -85,8 +85,9 @@ class Retention:
         latest = f"(SELECT max(sequence) FROM report WHERE time < ?1 AND sequence < {recent})"  # noqa: S608 - our own names
         while self._delete_reports(f"sequence <= {latest}", resend, clock + MAX_AHEAD):
             pass
-        for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour"), ("state", "since")):
+        for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour")):
             self._delete(f"DELETE FROM {table} WHERE {column} < ?", clock - longest)  # noqa: S608 - our own names
+        self._delete(f"DELETE FROM state WHERE sequence < ({LAST_STATE} AND entered < ?)", clock - longest)  # noqa: S608 - our own names
 
     def by_size(self, now: float) -> None:
         """Delete the oldest details, then the oldest rest, until the size is within its bound."""
@@ -156,10 +157,11 @@ class Retention:
 
     def _delete_rest(self) -> int:
         count = sum(map(self._delete_samples, (HOUR, DAY)))
-        keys = {"event": "sequence", "finding": "(id, first)", "counters": "(hour, run)", "state": "(part, since)"}
-        orders = {"event": "sequence", "finding": "last", "counters": "run, hour", "state": "since"}
+        keys = {"event": "sequence", "finding": "(id, first)", "counters": "(hour, run)", "state": "(part, sequence)"}
+        orders = {"event": "sequence", "finding": "last", "counters": "run, hour", "state": "sequence"}
         for table, key in keys.items():
-            chosen = f"SELECT {key.strip('()')} FROM {table} ORDER BY {orders[table]} LIMIT {CHUNK}"  # noqa: S608 - our own names
+            rest = f"WHERE sequence < ({LAST_STATE})" if table == "state" else ""
+            chosen = f"SELECT {key.strip('()')} FROM {table} {rest} ORDER BY {orders[table]} LIMIT {CHUNK}"  # noqa: S608 - our own names
             count += self._delete(f"DELETE FROM {table} WHERE {key} IN ({chosen})")  # noqa: S608 - our own names
         return count
 
@@ -338,6 +340,8 @@ class HistoryWriter(WriterThread):
         """Open the database; one that cannot be used is kept under another name. Returns why, or nothing."""
         try:
             self._connect()
+        except NewerVersionError as error:
+            raise ServiceError(str(error)) from error
         except (sqlite3.Error, ValueError) as error:
             if isinstance(error, sqlite3.Error) and _code(error) not in {*DAMAGED, sqlite3.SQLITE_ERROR}:
                 raise
@@ -384,7 +388,10 @@ class HistoryWriter(WriterThread):
     def _prepare(self, connection: sqlite3.Connection) -> None:
         if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             create(connection, self.reader.site, self.reader.machine)
-        check(connection, self.reader.site, self.reader.machine)
+        site, machine = check(connection)
+        if (site, machine) != (self.reader.site, self.reader.machine):
+            raise ValueError(f"it is of {machine} at {site}")
+        upgrade(connection, "main")
         connection.execute("PRAGMA synchronous = NORMAL")
         (page_size,) = connection.execute("PRAGMA page_size").fetchone()
         connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()

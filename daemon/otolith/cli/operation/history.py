@@ -69,6 +69,7 @@ def history(
     """Show what was estimated and announced before.
 
     FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
+    FILE may also be a history, like one that was set aside or copied: *.sqlite.
     Windows are kept for a day, minutes for 14 days, hours for a year, days and
     events for ten years, unless the machine file has other limits.
 
@@ -103,7 +104,7 @@ def history(
 
 
 def reader_of(machine: str) -> "HistoryReader":
-    """Return the history of a machine file, or of a machine by its name or that of its instance of the service.
+    """Return the history in a file, of a machine file, or of a machine by its name or that of its service.
 
     Raises:
         ConfigurationError: the file is wrong, or there is no history, or several, of that name.
@@ -111,6 +112,8 @@ def reader_of(machine: str) -> "HistoryReader":
     from otolith.storage.history import SUFFIX, HistoryReader, history_directory, history_path
     from otolith_drivers.errors import ConfigurationError, nearest
 
+    if machine.endswith(".sqlite"):
+        return HistoryReader.of_file(Path(machine))
     if machine.endswith(".toml") or "/" in machine or Path(machine).is_file():
         from otolith.machine import load_machine
 

@@ -1,0 +1,125 @@
+"""The tables of a history and their versions: creating, checking, and upgrading what an earlier version wrote."""
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Callable
+from typing import Literal
+
+SCHEMA_VERSION = 2
+APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
+PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
+
+Place = Literal["main", "temp"]
+
+_SCHEMA = """
+CREATE TABLE identity (site TEXT NOT NULL, machine TEXT NOT NULL);
+CREATE TABLE series (id INTEGER PRIMARY KEY, name TEXT NOT NULL, unit TEXT NOT NULL, UNIQUE (name, unit));
+CREATE TABLE sample (
+    resolution INTEGER NOT NULL, time REAL NOT NULL, series INTEGER NOT NULL, count INTEGER NOT NULL,
+    min REAL NOT NULL, mean REAL NOT NULL, max REAL NOT NULL, last REAL NOT NULL, low REAL, high REAL,
+    status TEXT NOT NULL, PRIMARY KEY (resolution, time, series)) WITHOUT ROWID;
+CREATE TABLE report (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text BLOB NOT NULL);
+CREATE TABLE event (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text TEXT NOT NULL);
+CREATE TABLE finding (
+    id TEXT NOT NULL, first REAL NOT NULL, last REAL NOT NULL, count INTEGER NOT NULL, text TEXT NOT NULL,
+    PRIMARY KEY (id, first)) WITHOUT ROWID;
+CREATE TABLE counters (hour REAL NOT NULL, run INTEGER NOT NULL, text TEXT NOT NULL, PRIMARY KEY (hour, run));
+CREATE TABLE clock (retention REAL NOT NULL, waited REAL NOT NULL);
+CREATE TABLE start (sequence INTEGER NOT NULL);
+"""
+_STATE = """
+CREATE TABLE {place}.state (
+    part TEXT NOT NULL, sequence INTEGER NOT NULL, entered REAL NOT NULL, since REAL NOT NULL, state TEXT NOT NULL,
+    PRIMARY KEY (part, sequence)) WITHOUT ROWID
+"""
+_DESCRIPTION = "CREATE TABLE {place}.description (text TEXT NOT NULL)"
+
+
+class NewerVersionError(ValueError):
+    """A later version of Otolith wrote the database."""
+
+
+def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
+    """Make an empty database a history."""
+    connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
+    connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute("PRAGMA journal_mode = WAL")
+    tables = f"{_SCHEMA}{_STATE.format(place='main')}; {_DESCRIPTION.format(place='main')};"
+    connection.executescript(f"BEGIN; {tables} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
+    with connection:
+        connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
+
+
+def check(connection: sqlite3.Connection) -> tuple[str, str]:
+    """Return site and machine of an open database.
+
+    Raises:
+        NewerVersionError: a later version of Otolith wrote it.
+        ValueError: it is no history of one machine.
+        sqlite3.Error: it is damaged or cannot be read.
+    """
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    version = _version(connection)
+    if application != APPLICATION_ID:
+        raise ValueError("it is no history of Otolith")
+    if version > SCHEMA_VERSION:
+        newer = f"version {version} of the format, and this Otolith reads 1 to {SCHEMA_VERSION}"
+        raise NewerVersionError(f"{newer}: install the newer Otolith again, or move the file away")
+    if version < 1:
+        raise ValueError(f"version {version} of the format: this Otolith reads 1 to {SCHEMA_VERSION}")
+    rows = connection.execute("SELECT site, machine FROM identity LIMIT 2").fetchall()
+    if len(rows) != 1 or not all(isinstance(name, str) for name in rows[0]):
+        raise ValueError("it is not of one machine")
+    site, machine = rows[0]
+    return site, machine
+
+
+def upgrade(connection: sqlite3.Connection, place: Place) -> None:
+    """Give a checked database the tables of the present version: in ``main`` all or nothing, or for this connection.
+
+    Tables in ``temp`` hide those of the file, which may be read-only then.
+
+    Raises:
+        sqlite3.Error: it is damaged, or the disk refuses.
+    """
+    if (version := _version(connection)) == SCHEMA_VERSION:
+        return
+    with connection:
+        connection.execute("BEGIN IMMEDIATE" if place == "main" else "BEGIN")
+        for number in range(version, SCHEMA_VERSION):
+            _UPGRADES[number](connection, place)
+        if place == "main":
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def _version(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
+def _from_1(connection: sqlite3.Connection, place: Place) -> None:
+    """Version 1 kept the begin of the cause of a state, but not when a report had the state first.
+
+    The change of the event from the same time has that; a state without event began with its window.
+    """
+    entered: dict[tuple[str, float, str], float] = {}
+    for time, text in connection.execute("SELECT time, text FROM event ORDER BY sequence"):
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # what the disk has damaged
+            event = json.loads(text)
+            for part in ("", event["part"]):
+                entered.setdefault((part, event["since"], event["state"]), time)
+    tables = {name for (name,) in connection.execute("SELECT name FROM main.sqlite_master")}
+    states = connection.execute("SELECT part, since, state FROM main.state").fetchall() if "state" in tables else []
+    if "description" not in tables:  # nor did its first releases have these two tables
+        connection.execute(_DESCRIPTION.format(place=place))
+    if place == "main":
+        connection.execute("DROP TABLE IF EXISTS main.state")
+    connection.execute(_STATE.format(place=place))
+    rows = sorted((entered.get((part, since, state), since), since, part, state) for part, since, state in states)
+    numbered = ((part, number, begin, since, state) for number, (begin, since, part, state) in enumerate(rows))
+    connection.executemany(f"INSERT INTO {place}.state VALUES (?, ?, ?, ?, ?)", numbered)  # noqa: S608 - our own names
+
+
+_UPGRADES: dict[int, Callable[[sqlite3.Connection, Place], None]] = {1: _from_1}
+"""By the version that they upgrade to the next one."""
