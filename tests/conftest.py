@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from otolith.acquisition.window import Window
 from otolith.cli.common import shipped_directory
@@ -24,8 +24,10 @@ EXAMPLES = shipped_directory("config")
 TESTS = Path(__file__).parent
 # Ports for tests. They are below the ephemeral range, so that the kernel never assigns them to another process.
 FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each process
-# The time of an example depends on the load of the computer; the same examples in every run.
-settings.register_profile("otolith", deadline=None, derandomize=True)
+# The time of an example, and of drawing it, depends on the load of the computer; the same examples in every run.
+# Examples that share a folder write their file anew.
+BY_LOAD = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
+settings.register_profile("otolith", deadline=None, derandomize=True, suppress_health_check=BY_LOAD)
 settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 

@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 
+from tests.waiting import PATIENCE
+
 COMMAND = """
 import os, signal, time
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # as otolith.__main__ does
@@ -28,7 +30,7 @@ def test_ctrl_c_shows_the_cursor_and_ends_the_command() -> None:
             assert process.stdout is not None
             assert process.stdout.readline() == b"ready\n"
             process.send_signal(signal.SIGINT)
-            _, shown = process.communicate(timeout=30.0)
+            _, shown = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
     assert process.returncode == -signal.SIGINT

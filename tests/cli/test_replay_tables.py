@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.health.schema import ReportDocument, Status
@@ -239,7 +239,7 @@ ANYTHING = st.text(max_size=400) | st.builds(
 )
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 @given(ANYTHING)
 def test_table_of_random_text_is_refused_or_read(tmp_path: Path, text: str) -> None:
     path = tmp_path / "data.csv"
@@ -250,7 +250,7 @@ def test_table_of_random_text_is_refused_or_read(tmp_path: Path, text: str) -> N
 ROW = st.tuples(st.floats(-0.2, 3.0), st.lists(JUNK | st.floats(-5, 5).map(repr), min_size=4, max_size=4))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(st.lists(ROW, min_size=2, max_size=80), st.booleans(), st.sampled_from([1.0, 0.1, 1e6]))
 def test_table_of_random_cells_is_refused_or_read(
     tmp_path: Path, rows: list[tuple[float, list[str]]], ordered: bool, pace: float

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.cli.replay import replay
@@ -209,8 +209,8 @@ def test_the_error_names_a_signal_that_was_not_recorded(recording: Path) -> None
 
 
 DAMAGE = st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=3)
-SHORT = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-LONG = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SHORT = settings(max_examples=8)
+LONG = settings(max_examples=40)
 
 
 def check_damaged(tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float) -> None:

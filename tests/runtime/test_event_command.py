@@ -88,10 +88,18 @@ def test_a_command_that_reads_nothing_and_one_that_succeeds_after_a_failure(
 
 
 def test_a_command_that_hangs_is_killed_with_its_children(tmp_path: Path, commands: list[EventCommand]) -> None:
-    command = shell(f"sleep 600 & echo $! > {tmp_path}/child; sleep 600", commands, timeout=0.5)
-    command.run(EVENT)
-    wait_for(lambda: command.failed == 1)
-    child = int((tmp_path / "child").read_text(encoding="ascii"))
+    started = tmp_path / "child"
+    command = shell(f"sleep 600 & echo $! > {started}; sleep 600", commands, timeout=0.5)
+
+    def has_begun() -> bool:
+        """Whether the shell came so far within the timeout, which it may not on a busy computer."""
+        failed = command.failed
+        command.run(EVENT)
+        wait_for(lambda: command.failed > failed)
+        return bool(started.exists() and started.read_text(encoding="ascii").strip())
+
+    wait_for(has_begun)
+    child = int(started.read_text(encoding="ascii"))
     wait_for(lambda: not is_running(child))
 
 

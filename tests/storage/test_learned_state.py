@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.discovery.motor import R_A, D, Faults, simulate_motor
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.adaptation.state import (
@@ -316,7 +316,7 @@ VALUES: st.SearchStrategy[object] = (
 FACTORS = st.sampled_from([-1.0, 0.0, 1e-30, 0.5, 2.0, 1e3, 1e30])
 
 
-SHORT = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SHORT = settings(max_examples=30)
 LONG = settings(SHORT, max_examples=150)
 
 

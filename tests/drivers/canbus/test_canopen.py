@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.canbus.decoder import FrameDecoder
@@ -150,7 +150,6 @@ def test_files_that_are_no_sheet_are_refused_in_one_line(tmp_path: Path, content
     assert "\n" not in str(caught.value)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=5000)
 @given(data=st.data())
 def test_mutated_sheets_are_read_or_refused_in_one_line(tmp_path: Path, data: st.DataObject) -> None:
     try:

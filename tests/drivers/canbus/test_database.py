@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
@@ -268,7 +268,6 @@ def mutations(text: str) -> st.SearchStrategy[str]:
     return st.lists(pieces, min_size=1, max_size=6).map(apply)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=5000)
 @given(data=st.data(), kind=st.sampled_from([("dbc", DBC.read_text(encoding="utf-8")), ("kcd", KCD), ("sym", SYM)]))
 def test_mutated_databases_are_read_or_refused_in_one_line(
     tmp_path: Path, data: st.DataObject, kind: tuple[str, str]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import can
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Sample
@@ -46,7 +46,6 @@ def receiver(machine: OwnMachine) -> CanReceiver:
     return build(options, SETUP)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.sampled_from([385, 641, 7]), st.binary(max_size=8), st.booleans(), st.booleans())
 def test_any_frame_is_decoded_or_counted(
     own_machine: OwnMachine, identifier: int, data: bytes, remote: bool, error: bool

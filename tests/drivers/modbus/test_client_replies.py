@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.modbus.client import ConnectionLostError, ExceptionReplyError, NoReplyError, ReadOnlyClient
@@ -103,7 +103,7 @@ def test_late_device_is_judged_before_delivery() -> None:
 WORDS = floats(24.0, 1.5)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(st.one_of(
     st.binary(max_size=300),
     st.tuples(st.integers(0, 19), st.integers(0, 16), st.binary(max_size=6)),

@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.acquisition.playback import Playback
@@ -222,7 +222,7 @@ def check_any(path: Path, held: int = 0) -> None:
     assert found >= held or "without a frame" in summary or bad or warnings
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(st.sampled_from(PACKED), st.binary(max_size=300))
 def test_can_log_of_random_bytes_is_refused_or_counted(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"garbage{suffix}"
@@ -235,7 +235,7 @@ def test_can_log_of_random_bytes_is_refused_or_counted(tmp_path: Path, suffix: s
 SHARE = st.floats(0.0, 1.0, exclude_max=True)
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 @given(st.sampled_from(PACKED), st.lists(st.tuples(SHARE, st.integers(0, 255)), max_size=4), SHARE)
 def test_can_log_with_changed_bytes_is_refused_or_read(
     tmp_path: Path, frames: list[can.Message], suffix: str, changes: list[tuple[float, int]], end: float

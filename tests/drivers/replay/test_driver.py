@@ -17,7 +17,7 @@ from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from otolith_drivers.replay.readers import Rows
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
-from tests.waiting import wait_for, within
+from tests.waiting import PATIENCE, wait_for, within
 
 FAST = "as fast as possible"
 ENDED = "the recording has ended"
@@ -94,12 +94,12 @@ def test_replay_waits_for_a_slow_receiver(tmp_path: Path) -> None:
     gate, got = threading.Event(), list[int]()
 
     def deliver(samples: Any) -> None:
-        gate.wait(30.0)
+        gate.wait(PATIENCE)
         got.append(len(samples))
 
     driver = driver_of(path, pace=FAST)
     driver.open(deliver)
-    time.sleep(0.5)
+    wait_for(lambda: driver.counters().received > 0)
     assert driver._reader is not None
     assert driver._reader.progress < 1.0
     assert driver.counters().received <= 1000

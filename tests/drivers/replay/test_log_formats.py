@@ -14,7 +14,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
@@ -315,7 +315,6 @@ def test_no_content_raises(head: bytes) -> None:
     assert len(head) < HEAD
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), kind=st.sampled_from(sorted(WRITERS)))
 def test_changed_bytes_end_nothing(tmp_path: Path, frames: Frames, data: st.DataObject, kind: str) -> None:
     path = written(tmp_path, frames[:20], kind)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
@@ -59,7 +59,7 @@ def test_a_change_of_its_text_begins_a_recording(tmp_path: Path, segments: list[
     assert reader.bad == 0
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(st.lists(st.sampled_from(["", "a", "b", "Straße", "nan"]), min_size=1, max_size=60), st.integers(10, 60))
 def test_marks_do_not_depend_on_chunks(tmp_path: Path, segments: list[str], chunk: int) -> None:
     path = table(tmp_path, segments)
