@@ -8,6 +8,7 @@ import ipaddress
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,9 +18,11 @@ from otolith.acquisition.samples import Check
 from otolith.health.diagnosis import OwnRule
 from otolith.health.schema import Language
 from otolith.twin.definition import Definition
-from otolith_drivers.base import Driver, DriverType, NamedSource, Sampling, Setup, SeveralSources, Signal, find_driver
+from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
 from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.guard import GuardedSource
+from otolith_drivers.sources import SeveralSources
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
@@ -286,10 +289,12 @@ class DriverConfig:
         """Names of the signals that the driver reads."""
         return tuple(signal.name for signal in self.setup.signals)
 
-    def build(self) -> Driver:
-        """Return the driver, which is not open."""
+    def build(self) -> GuardedSource:
+        """Return the driver, which is not open, behind its guard."""
         with self.located_errors():
-            return self.module.build(self.options, self.setup)
+            return GuardedSource.built(
+                self.name, self.signals, self.setup.sample_period, partial(self.module.build, self.options, self.setup)
+            )
 
     @contextlib.contextmanager
     def located_errors(self) -> Iterator[None]:
@@ -403,9 +408,8 @@ def _driver_config(
 
 def build_driver(configs: Sequence[DriverConfig]) -> Driver:
     """Return the driver of a machine: one, or several as one."""
-    if len(configs) == 1:
-        return configs[0].build()
-    return SeveralSources(tuple(NamedSource(config.name, config.build(), config.signals) for config in configs))
+    sources = tuple(config.build() for config in configs)
+    return sources[0] if len(sources) == 1 else SeveralSources(sources)
 
 
 def own_keys(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,9 +15,11 @@ from otolith.estimation.information import Identifiability
 from otolith.health.schema import ParameterDocument, Status
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
-from otolith_drivers.base import Counters, Deliver, Driver, Link, NamedSource, Sample, Sampling, SeveralSources
+from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
 from otolith_drivers.conformance import CONTRACT, Rig
 from otolith_drivers.errors import DeviceError
+from otolith_drivers.guard import GuardedSource
+from otolith_drivers.sources import SeveralSources
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import RIGS
 from tests.waiting import PATIENCE, wait_for, within
@@ -34,7 +36,7 @@ class FakeDriver:
         self.calls.append("open")
         if self.fault:
             raise DeviceError(self.fault)
-        deliver([Sample("x", 1.0, 2.0)])
+        deliver([Sample("x", time.monotonic(), 2.0)])
 
     def close(self) -> None:
         self.calls.append("close")
@@ -52,7 +54,7 @@ class FakeDriver:
 def both(first: Link, second: Link, fault: str = "") -> tuple[SeveralSources, tuple[FakeDriver, FakeDriver]]:
     one = FakeDriver(first, Counters(10, 1, 2, 3), Sampling.CYCLIC)
     two = FakeDriver(second, Counters(20, 0, 0, 1), Sampling.POLLED, fault)
-    sources = (NamedSource("drive", one, ("V_a", "i")), NamedSource("encoder", two, ("omega",)))
+    sources = (GuardedSource("drive", one, ("V_a", "i")), GuardedSource("encoder", two, ("omega",)))
     return SeveralSources(sources), (one, two)
 
 
@@ -135,7 +137,7 @@ def test_a_source_that_cannot_be_opened_is_named_and_tried_again_while_the_other
 
 def test_sources_of_which_none_can_be_opened_are_an_error() -> None:
     one, two = (FakeDriver(UP, Counters(), Sampling.TRUE, fault) for fault in ("can8: no such", "can9: no such"))
-    sources = SeveralSources((NamedSource("drive", one, ("i",)), NamedSource("encoder", two, ("omega",))))
+    sources = SeveralSources((GuardedSource("drive", one, ("i",)), GuardedSource("encoder", two, ("omega",))))
     with pytest.raises(DeviceError, match="source 'drive': can8: no such; source 'encoder': can9: no such"):
         sources.open(lambda _: None)
     assert one.calls == two.calls == ["open", "close"]
@@ -189,7 +191,8 @@ def two_buses(machine: OwnMachine) -> Iterator[Rig]:
         rigs = {name: stack.enter_context(RIGS[name](machine)) for name in ("can", "modbus")}
         only = {"can": "i", "modbus": "omega"}
         sources = tuple(
-            NamedSource(name, cast("Driver", OneSignal(rigs[name], signal)), (signal,)) for name, signal in only.items()
+            GuardedSource(name, cast("Driver", OneSignal(rigs[name], signal)), (signal,))
+            for name, signal in only.items()
         )
         yield Rig(SeveralSources(sources), rigs["can"].expected, rigs["can"].emit)
 

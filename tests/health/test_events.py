@@ -229,7 +229,8 @@ def test_an_absent_source_is_an_event_of_the_bus_while_windows_stay_good() -> No
     documents = assessed([*healthy, *down, *back])
     assert changes(documents) == [(5, EventChange.RAISED, Level.WATCH), (10, EventChange.CLEARED, Level.WATCH)]
     (event,) = documents[7].events
-    assert (event.part, event.text, event.condition) == ("bus", gone["encoder"], "a source gives no samples")
+    assert (event.part, event.text) == ("bus", gone["encoder"])
+    assert "a source gives no samples" in event.condition
     assert event.start == 3 * LENGTH
     assert [state_of(documents[7], part) for part in ("bus", "winding")] == [Level.WATCH, Level.OK]
     assert documents[7].health is not None

@@ -38,7 +38,7 @@ class FindingKind(StrEnum):
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
-    NO_SOURCE = "no source"  # One of several sources is down or gave no sample
+    NO_SOURCE = "no source"  # One of several sources is down or gave no sample, or a source has a defect
 
 
 class ComponentStatus(StrEnum):

@@ -164,7 +164,7 @@ def driver_document(link: Link) -> DriverDocument:
 
 
 def absent_sources(link: Link, window: Window, outputs: Collection[str]) -> dict[str, str]:
-    """Return by name which of several sources are down or gave no sample in the window, in words.
+    """Return by name which of several sources are down or gave no sample in the window, or have a defect, in words.
 
     A source that only has commands may be silent: none of them has changed.
     """
@@ -177,6 +177,8 @@ def absent_sources(link: Link, window: Window, outputs: Collection[str]) -> dict
         elif is_expected and all(window.missing_in(name).all() for name in state.signals if name in window.signals):
             silent = f"is silent: {state.link.warnings[0]}" if state.link.warnings else "sent nothing in this window"
             absent[state.name] = f"{what} {silent}"
+        elif state.link.defect:
+            absent[state.name] = f"{what} is defective: {state.link.defect}"
     return absent
 
 
