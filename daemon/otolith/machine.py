@@ -25,6 +25,7 @@ from otolith.machine_file import (
     ParameterTable,
     RawQuantity,
     SignalTable,
+    UnmeasuredTable,
     WindowTable,
     build_driver,
     driver_configs,
@@ -35,8 +36,9 @@ from otolith.machine_file import (
 from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
+from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.base import Driver, Sampling, sampling_of
-from otolith_drivers.config_files import Context, expect, parse, read, validate
+from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.units import Quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
@@ -76,6 +78,8 @@ class LoadedMachine:
     plan: MonitoringPlan  # Limits of parameters and components, and the rules of the diagnosis
     signal_tables: Mapping[str, SignalTable]  # Of each signal of the twin
     built_driver: Driver | None  # None if the file was loaded without its driver
+    complete: Definition  # The twin as its author wrote it, with inputs that no sensor measures
+    unmeasured: tuple[UnmeasuredInput, ...] = ()  # Those inputs
 
     @property
     def driver(self) -> Driver:
@@ -141,10 +145,10 @@ class LoadedMachine:
     @property
     def signal_fingerprint(self) -> str:
         """Hash of everything in the file that signal values depend on; empty if the file has no signals."""
-        if not self.file.signals:
+        if not self.file.read_signals:
             return ""
         tables = self.file.drivers or ({},)
-        used = {name: table for name, table in self.file.signals.items() if name in self.twin.signals}
+        used = {name: table for name, table in self.file.read_signals.items() if name in self.twin.signals}
         options: list[Any] = [{key: table.get(key) for key in FINGERPRINT_KEYS} for table in tables]
         read: dict[str, Any] = {name: own_keys(table) for name, table in used.items()}
         if len(tables) > 1:
@@ -174,17 +178,47 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     expect(source, data, "machine")
     file = validate(data, MachineFile, source)
     context = Context(source)
-    twin = _twin(file, path, context)
+    complete = _twin(file, path, context)
+    unmeasured = _unmeasured(file, complete, source)
+    twin = _without_sensors(file, complete, unmeasured, context)
     signals = {
         name: validate(_common(table), SignalTable, source, under=("signals", name))
-        for name, table in file.signals.items()
+        for name, table in file.read_signals.items()
     }
     tables = {name: signals.get(name, SignalTable()) for name in twin.signals}
     problem = replace(_problem(file, twin, context), unchecked=_unchecked(tables))
     driver = None
-    if with_driver and (file.drivers or file.signals or not for_replay):
+    if with_driver and (file.drivers or file.read_signals or not for_replay):
         driver = build_driver(driver_configs(file, twin, source))
-    return LoadedMachine(path, file, twin, problem, _plan(file, twin, problem, context), tables, driver)
+    plan = _plan(file, twin, problem, context)
+    return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured)
+
+
+def _unmeasured(file: MachineFile, twin: Definition, source: SourceFile) -> tuple[UnmeasuredInput, ...]:
+    """Return the inputs without a sensor; raise ConfigurationError if one is none, or has other keys."""
+    inputs, found = [driven.name for driven in twin.inputs], []
+    for name, written in file.unmeasured.items():
+        table = validate(written, UnmeasuredTable, source, under=("signals", name))
+        if name not in inputs:
+            what = "an output, which must be measured" if name in twin.signals else nearest(name, inputs)
+            fault = f"only an input of the twin may be without a sensor: {what}"
+            Context(source).fail(("signals", name), fault)
+        assumption = Assumption.PROPORTIONAL if table.unknown is None else Assumption(table.unknown)
+        found.append(UnmeasuredInput(name, assumption, table.proportional_to or ""))
+    return tuple(found)
+
+
+def _without_sensors(
+    file: MachineFile, twin: Definition, unmeasured: Sequence[UnmeasuredInput], context: Context
+) -> Definition:
+    """Return the twin with the inputs that no sensor measures replaced by what is assumed of them."""
+    for item in unmeasured:
+        if item.name in file.noise:
+            context.fail(("noise", item.name), f"{item.name} is not measured, so it has no noise: remove this line")
+        key = "proportional_to" if item.expression else "unknown"
+        with context.at("signals", item.name, key):
+            twin = without_sensor(twin, item)
+    return twin
 
 
 def _common(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -230,7 +264,7 @@ def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:
     inputs = {signal.name: (signal.unit, 0.0) for signal in twin.inputs}
     outputs = {signal.name: (signal.unit, signal.noise) for signal in twin.outputs}
     noise = _noise("noise", file.noise, inputs | outputs, context)
-    states = {state.name: (f"({state.unit})/s^0.5", 0.0) for state in twin.states}
+    states = {state.name: (f"({state.unit})/s^0.5", state.process_noise) for state in twin.states}
     return Problem(
         twin=twin,
         known=known,
@@ -461,6 +495,8 @@ def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> froz
     allowed_inputs = allowed("inputs", table.inputs, [name for name in inputs if name])
     doubted = {of(name) for name in allowed("sensors", table.sensors, twin.signals) for of in (sensor_site, gain_site)}
 
+    drifting = {state.name for state in twin.states if state.process_noise}  # what follows the data explains nothing
+
     def is_allowed(site: str, family: str, name: str) -> bool:
         of_site = site in allowed_sites and family in families and (not name or name in allowed_inputs)
         return of_site or site in doubted
@@ -470,5 +506,5 @@ def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> froz
         for site in sites(twin)
         for family in FAMILY_NAMES
         for name in inputs
-        if not is_allowed(site.name, family, name)
+        if name in drifting or not is_allowed(site.name, family, name)
     )

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from otolith.acquisition.samples import Check
 from otolith.health.diagnosis import OwnRule
@@ -135,6 +135,19 @@ class SignalTable(StrictModel):
     times: Sampling | None = None  # Meaning of the times of its samples; without it what the source gives
     on_change: bool | None = None  # Whether a command is recorded only when it changes; by default the record shows it
     checks: tuple[Check, ...] = tuple(Check)  # The checks of its data; an empty list turns them off
+
+
+class UnmeasuredTable(StrictModel):
+    """What stands in place of the keys of a signal if no sensor measures it: exactly one of two keys."""
+
+    unknown: Literal["constant", "slow", "friction"] | None = None
+    proportional_to: str | None = None  # An expression in the twin language
+
+    @model_validator(mode="after")
+    def _has_one_key(self) -> "UnmeasuredTable":
+        if (self.unknown is None) == (self.proportional_to is None):
+            raise ValueError('write either unknown = "constant" or proportional_to = "omega^2"')
+        return self
 
 
 class WindowTable(StrictModel):
@@ -268,6 +281,17 @@ class MachineFile(StrictModel):
             return self.driver
         return (self.driver,) if self.driver else ()
 
+    @property
+    def unmeasured(self) -> dict[str, dict[str, Any]]:
+        """The tables of ``[signals]`` of inputs that no sensor measures, see :class:`UnmeasuredTable`."""
+        known = UnmeasuredTable.model_fields.keys()
+        return {name: table for name, table in self.signals.items() if table.keys() & known}
+
+    @property
+    def read_signals(self) -> dict[str, dict[str, Any]]:
+        """The tables of ``[signals]`` of what a driver reads."""
+        return {name: table for name, table in self.signals.items() if name not in self.unmeasured}
+
 
 TEMPERATURE_UNIT = "K"
 
@@ -316,12 +340,14 @@ def driver_configs(file: MachineFile, twin: Definition, source: SourceFile) -> t
         context.fail(("driver",), f"missing: {remedy}")
     units = signal_units(file, twin)
     needed = list(units)
-    for name in file.signals:
+    for name in file.read_signals:
         if name not in needed:
             context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
     for name, unit in units.items():
-        if name not in file.signals:
+        if name not in file.read_signals:
             reason = f"the twin needs {', '.join(twin.signals)}" if name in twin.signals else "[parameters] names it"
+            if twin.ordinary_range(name) is not None:
+                reason += f'; if no sensor measures it, write {name} = {{ unknown = "constant" }}, "slow" or "friction"'
             context.fail(("signals",), f"{name} ({unit}) is missing: {reason}")
     names = source_names(file, context)
     readers = {name: _source_of(name, file, names, context) for name in needed}
@@ -368,7 +394,7 @@ def _place(file: MachineFile, number: int) -> tuple[int | str, ...]:
 
 def _source_of(signal: str, file: MachineFile, names: Sequence[str], context: Context) -> str:
     """Return the name of the driver that reads ``signal``."""
-    written = file.signals[signal].get("source")
+    written = file.read_signals[signal].get("source")
     if written is None and len(names) == 1:
         return names[0]
     if written is None:
@@ -397,7 +423,7 @@ def _driver_config(
         Signal(
             signal,
             units[signal],
-            validate(own_keys(file.signals[signal]), module.Source, source, under=("signals", signal)),
+            validate(own_keys(file.read_signals[signal]), module.Source, source, under=("signals", signal)),
             twin.ordinary_range(signal),
         )
         for signal in signals

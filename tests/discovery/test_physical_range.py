@@ -11,7 +11,7 @@ from benchmarks.discovery.motor import Faults, simulate_motor, windows
 from benchmarks.discovery.setting import problem, screen
 
 from otolith.discovery import candidates
-from otolith.discovery.candidate_forms import PhysicalRange, rate_terms
+from otolith.discovery.candidate_forms import PhysicalRange
 from otolith.discovery.candidates import best_guesses, find_candidates
 from otolith.discovery.linear_response import LinearResponse
 from otolith.discovery.screening import ScoredGuess, candidate_library, linearised
@@ -19,6 +19,7 @@ from otolith.discovery.search import search
 from otolith.estimation.information import Prior, initial_prior
 from otolith.machine import find_twin
 from otolith.twin.components import COMPONENT_FAMILIES, SourceKind, sites, sources
+from otolith.twin.rates import rate_terms
 from otolith.twin.symbolic import system_of
 from tests.discovery.two_mass import DryFriction, simulate
 from tests.discovery.two_mass import problem as two_mass_problem

@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.cli.commissioning.check import describe
+from otolith.cli.commissioning.check import describe, without_sensors
 from otolith.machine import load_machine, load_twin
 from otolith.twin.expressions import FUNCTIONS
 from otolith.twin.identifiability import structural_identifiability
@@ -21,6 +21,8 @@ DBC = """VERSION "1"
 BU_: Drive Monitor
 BO_ 400 Drive: 8 Drive
  SG_ MotorTorque : 0|16@1- (0.01,0) [-300|300] "Nm" Monitor
+ SG_ MotorVoltage : 32|16@1- (0.01,0) [-300|300] "V" Monitor
+ SG_ MotorCurrent : 48|16@1- (0.01,0) [-300|300] "A" Monitor
  SG_ MotorSpeed : 16|16@1- (0.1,0) [-3000|3000] "rpm" Monitor
 """
 
@@ -38,6 +40,11 @@ def test_guide_files_are_read_and_identifiable(folder: Path) -> None:
     plan = load_machine(folder / "fan-3.toml")
     assert [parameter.name for parameter in plan.problem.free] == ["T_c", "k"]
     assert any("MotorSpeed [rpm]" in line for line in describe(plan))
+
+
+def test_guide_prints_what_is_lost_without_a_sensor(folder: Path) -> None:
+    ((name, expected),) = re.findall(r"<!-- lost: (\S+) -->\n```\n(.*?)\n```", GUIDE, re.DOTALL)
+    assert without_sensors(load_machine(folder / name)) == expected.splitlines()
 
 
 def test_guide_prints_the_real_error(folder: Path) -> None:

@@ -249,3 +249,32 @@ def test_limits_of_the_twin_that_do_not_fit_are_not_blamed_on_the_machine_file(o
         ConfigurationError, match=r"limits of the twin do not fit this value: watch: .*write watch and act"
     ):
         limits_of(own_machine, 'value = "6.2 ohm"')
+
+
+def test_an_unmeasured_input_is_configured_like_any_parameter(tmp_path: Path) -> None:
+    """Limits and bounds of [parameters], process noise of a state; a replay needs no driver for it."""
+    path = tmp_path / "machine.toml"
+    head = '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n[signals]\nT_load = { unknown = '
+    rows = '[parameters]\nT_load = { value = "20 mN*m", estimate = true, low = "0 N*m", watch = "+50 %" }\n'
+    path.write_text(f'{head}"constant" }}\n{rows}', encoding="utf-8")
+    machine = load_machine(path, for_replay=True)
+    assert machine.twin.signals == ("V_a", "i", "omega")
+    (free,) = (row for row in machine.problem.free if row.name == "T_load")
+    assert (free.nominal, free.low) == (0.02, 0.0)
+    assert machine.plan.parameters["T_load"].limits[0].value == pytest.approx(0.03)
+    path.write_text(f'{head}"slow" }}\n', encoding="utf-8")
+    assert load_machine(path, for_replay=True).problem.process_noise == pytest.approx((0.0, 0.0, 0.004))
+    path.write_text(f'{head}"slow" }}\n[process_noise]\nT_load = "1 mN*m/s^0.5"\n', encoding="utf-8")
+    machine = load_machine(path, for_replay=True)
+    assert machine.problem.process_noise == pytest.approx((0.0, 0.0, 0.001))
+    assert "shaft/linear/T_load" in machine.problem.excluded  # what follows the data explains nothing
+
+
+def test_the_tables_of_a_driver_leave_out_an_unmeasured_input(tmp_path: Path) -> None:
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    text = text.replace("scenarios/", f"{EXAMPLES}/scenarios/").replace('T_load = "0.2 mN*m"', "")
+    path = tmp_path / "machine.toml"
+    path.write_text(text.replace('{ signal = "LoadTorque" }', '{ unknown = "friction" }'), encoding="utf-8")
+    machine = load_machine(path)
+    assert set(machine.signal_tables) == set(machine.twin.signals) == {"V_a", "i", "omega"}
+    assert "T_load" not in machine.driver.describe()[0]

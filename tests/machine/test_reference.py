@@ -26,6 +26,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[parameters]", "key", machine_file.ParameterTable),
     ("[components]", "key", machine_file.LimitsTable),
     ("[[rule]]", "key", OwnRule),
+    ("unknown", "key of an unmeasured input", machine_file.UnmeasuredTable),
     ("[window]", "key", machine_file.WindowTable),
     ("[estimation]", "key", machine_file.EstimationTable),
     ("[discovery]", "key", machine_file.DiscoveryTable),

@@ -241,7 +241,7 @@ def measured_speeds(base: Definition) -> dict[str, str]:
     """Return the name of each place whose speed is a state that a sensor shows, and that of the speed."""
     rates = {left[4:-1]: text.strip() for left, text in base.equations if left.startswith("der(")}
     rates |= {f"angle({name})": name for name, _ in _speeds(base)}
-    shown = {state.name for state in base.states if _integral_unit(state.unit)} & {row.name for row in base.outputs}
+    shown = {state.name for state in base.states if integral_unit(state.unit)} & {row.name for row in base.outputs}
     return {place: speed for place, speed in rates.items() if speed in shown}
 
 
@@ -261,16 +261,16 @@ def sources(base: Definition) -> tuple[ComponentSource, ...]:
 
 def _input_kind(unit: str) -> SourceKind:
     """Return the kind of an input: a place that is given is an ordinary signal."""
-    return SourceKind.SPEED if _integral_unit(unit) else SourceKind.SIGNAL
+    return SourceKind.SPEED if integral_unit(unit) else SourceKind.SIGNAL
 
 
 def _kind(unit: str) -> SourceKind:
     if unit in ("rad", "m"):
         return SourceKind.PLACE
-    return SourceKind.SPEED if _integral_unit(unit) else SourceKind.SIGNAL
+    return SourceKind.SPEED if integral_unit(unit) else SourceKind.SIGNAL
 
 
-def _integral_unit(unit: str) -> str:
+def integral_unit(unit: str) -> str:
     """Return the unit of the integral of a speed; empty if ``unit`` is that of no speed."""
     for speed, integral in INTEGRAL_UNITS.items():
         # 1/s has the dimension of an angular speed too, but may be the rate of anything.
@@ -287,9 +287,9 @@ def _speeds(base: Definition) -> list[tuple[str, str]]:
     """States that are speeds, with the unit of their integral; without those whose integral is a state already."""
     integrated = {text.strip() for left, text in base.equations if left.startswith("der(")}
     return [
-        (state.name, _integral_unit(state.unit))
+        (state.name, integral_unit(state.unit))
         for state in base.states
-        if state.name not in integrated and _integral_unit(state.unit)
+        if state.name not in integrated and integral_unit(state.unit)
     ]
 
 

@@ -56,6 +56,7 @@ class StateVariable:
     initial: float = 0.0  # Where the search for the initial state begins if no output shows the state
     low: float = -1e3
     high: float = 1e3
+    process_noise: float = 0.0  # Per square root of a second, where a machine file gives none
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.twin.definition import Definition, Role
-from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twin.kernel import Excitation, Kernel, kernel_of
 
 # Decisions. docs/reference/thresholds-twin.md gives the origin of each and the test that guards it.
 RECORDS, TRIALS = 300, 3
@@ -20,6 +20,7 @@ CHANGE_PROBABILITY = 0.05  # per record, of the random input levels: 15 changes 
 PERIODS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # s: one of them suits the machine's time constants
 THRESHOLD_PERIOD = 1e-2  # s
 SUBSTEPS, FINER_SUBSTEPS = 8, 16
+SETTLING_ROUNDS = 3  # experiments of each period in which a machine settles at constant inputs
 PARAMETER_SPREAD = 0.1  # of the width of the bounds, around the nominal values
 MAX_STEP_ERROR = 1e-4  # of an output's range: change of the prediction between the two numbers of substeps
 MIN_SENSITIVITY = 1e-9  # of the largest column norm: below it no output depends on the parameter
@@ -40,10 +41,13 @@ class StructuralIdentifiability:
     reason: str  # Empty if it can be estimated
 
 
-def structural_identifiability(definition: Definition, seed: int = 1) -> list[StructuralIdentifiability]:
+def structural_identifiability(
+    definition: Definition, seed: int = 1, *, settled: bool = False
+) -> list[StructuralIdentifiability]:
     """Whether each parameter could be estimated beside those whose role is estimated, and the initial state.
 
-    The others are given, as without a machine file that says otherwise.
+    The others are given, as without a machine file that says otherwise. With ``settled``, inputs are constant and the
+    machine is where they have brought it, as at one set-point.
     """
     random = np.random.default_rng(seed)
     trials: list[list[StructuralIdentifiability]] = []
@@ -51,7 +55,7 @@ def structural_identifiability(definition: Definition, seed: int = 1) -> list[St
         # Each trial is judged alone: a combination that acts as one parameter differs from point to point.
         trials += [
             [_judge(definition, columns, index) for index in range(len(definition.parameters))]
-            for columns in (_sensitivities(definition, period, random) for _ in range(TRIALS))
+            for columns in (_sensitivities(definition, period, random, settled=settled) for _ in range(TRIALS))
             if np.isfinite(columns).all()
         ]
     if not trials:
@@ -59,7 +63,7 @@ def structural_identifiability(definition: Definition, seed: int = 1) -> list[St
     best = max(trials, key=lambda trial: sum(result.identifiable - (result.reason == DEAD) for result in trial))
     return [
         _not_identifiable(result.name, THRESHOLD)
-        if result.reason == DEAD and _acts_as_threshold(definition, result.name)
+        if result.reason == DEAD and not settled and _acts_as_threshold(definition, result.name)
         else result
         for result in best
     ]
@@ -69,7 +73,7 @@ def _not_identifiable(name: str, reason: str) -> StructuralIdentifiability:
     return StructuralIdentifiability(name, identifiable=False, reason=reason)
 
 
-def _sensitivities(definition: Definition, period: float, random: np.random.Generator) -> Array:
+def _sensitivities(definition: Definition, period: float, random: np.random.Generator, *, settled: bool) -> Array:
     """(records * outputs, parameters + states), each column per width of its bounds, each row per noise.
 
     NaN if the integrator's step is too long for the machine: the sensitivities would be those of the integrator.
@@ -81,14 +85,30 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
     values = np.clip(nominal + PARAMETER_SPREAD * (high - low) * random.uniform(-0.5, 0.5, len(nominal)), low, high)
     initial = np.array([state.initial for state in definition.states])
     excitation = _excitation(definition, period, random)
+    if settled:
+        excitation = replace(excitation, inputs=np.repeat(excitation.inputs[:1], RECORDS, axis=0))
+        initial = _settled(kernel, values, initial, excitation.inputs)
     outputs, slopes, _, _ = kernel.sensitivities(values, initial, excitation)
     finer = kernel.simulate(values[None], initial[None], replace(excitation, substeps=FINER_SUBSTEPS))[0]
     widths = np.concatenate([high - low, [state.high - state.low for state in definition.states]])
     noise = np.array([output.noise for output in definition.outputs])
     with np.errstate(over="ignore", invalid="ignore"):
-        resolved = np.abs(outputs - finer).max(axis=0) <= MAX_STEP_ERROR * np.ptp(finer, axis=0)
+        resolved = np.abs(outputs - finer).max(axis=0) <= MAX_STEP_ERROR * np.maximum(np.ptp(finer, axis=0), noise)
         columns = (slopes * widths / noise[None, :, None]).reshape(-1, len(widths))
     return columns if resolved.all() else np.full((1, 1), np.nan)
+
+
+def _settled(kernel: Kernel, values: Array, initial: Array, inputs: Array) -> Array:
+    """Return the state (states,) to which constant ``inputs`` bring the machine, with longer and longer steps."""
+    for period in np.repeat(PERIODS, SETTLING_ROUNDS):
+        coarse, fine = (
+            kernel.sensitivities(values, initial, Excitation.uniform(inputs, period, substeps), []).last
+            for substeps in (SUBSTEPS, FINER_SUBSTEPS)
+        )
+        if not np.allclose(coarse, fine, rtol=MAX_STEP_ERROR, atol=0.0):
+            break
+        initial = fine
+    return initial
 
 
 def _acts_as_threshold(definition: Definition, name: str) -> bool:

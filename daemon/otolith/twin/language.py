@@ -26,7 +26,7 @@ from otolith.twin.expressions import (
     names_in,
     parse,
 )
-from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, expect, validate
+from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, dotted, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, limit_values, to_base
@@ -141,6 +141,13 @@ def read_twin(page: SourceFile) -> Definition:
     if faults:
         raise ConfigurationError("\n".join(dict.fromkeys(faults)))
     return definition
+
+
+def equation_faults(definition: Definition) -> list[str]:
+    """Return what is wrong with the equations of a twin that was made from another one, one text each."""
+    faults: list[str] = []
+    _EquationChecker(definition, lambda at, text: faults.append(f"{dotted(at)}: {text}")).check()
+    return faults
 
 
 class _Reader:

@@ -5,6 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
+from otolith.twin.definition import Definition, Role
+from otolith.twin.identifiability import structural_identifiability
 from otolith_drivers.base import Link, Sample
 from otolith_drivers.user_dirs import check_writable
 
@@ -83,6 +86,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         *(f"  {name} = {text}" for name, text, _ in twin.definitions),
         *(f"  {left} = {right}" for left, right in twin.equations),
         *(machine.driver.describe() if machine.built_driver else sources),
+        *without_sensors(machine),
         *_delays(machine),
         f"windows of {file.window.length:g} s, {machine.records} records",
     ]
@@ -110,6 +114,61 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
+
+
+def without_sensors(machine: LoadedMachine) -> list[str]:
+    """What is assumed of inputs that no sensor measures, and what can therefore be estimated no longer, or less."""
+    if not machine.unmeasured:
+        return []
+    names = ", ".join(item.name for item in machine.unmeasured)
+    free, known = dict.fromkeys(row.name for row in machine.problem.free), dict(machine.problem.known)
+    lines = [f"not measured: {item.description}" for item in machine.unmeasured]
+    configured, complete = (_configured(machine, twin) for twin in (machine.twin, machine.complete))
+    rows = {row.name: row for row in structural_identifiability(configured)}
+    lines += [
+        f"! {name} cannot be estimated: {rows[name].reason}: give one of them a value, or measure {names}"
+        for name in free
+        if not rows[name].identifiable
+    ]
+    constant = {row.name: row for row in structural_identifiability(configured, settled=True)}
+    lines += [
+        f"while inputs are constant, {name} cannot be estimated: {constant[name].reason}"
+        for name in free
+        if rows[name].identifiable and not constant[name].identifiable
+    ]
+    before, after = (
+        {row.name for row in structural_identifiability(_all_estimated(twin)) if row.identifiable}
+        for twin in (complete, configured)
+    )
+    own = {row.name for row in complete.parameters}
+    lost = [
+        row.name
+        for row in configured.parameters
+        if row.name not in after and (row.name in before or row.name not in own)
+    ]
+    given, resting = [name for name in lost if name in known], [name for name in lost if name in free]
+    if given and resting:
+        ratios = f"without {names} the signals have only their ratios"
+        lines.append(f"{', '.join(resting)}: as right as the given {', '.join(given)}; {ratios}")
+    return lines
+
+
+def _configured(machine: LoadedMachine, twin: Definition) -> Definition:
+    """The twin with roles and bounds of the machine file."""
+    free, known = {row.name: row for row in machine.problem.free}, dict(machine.problem.known)
+    return replace(
+        twin,
+        parameters=tuple(
+            replace(free[row.name], role=Role.ESTIMATED)
+            if row.name in free
+            else replace(row, nominal=known[row.name], role=Role.INSTRUMENTED)
+            for row in twin.parameters
+        ),
+    )
+
+
+def _all_estimated(twin: Definition) -> Definition:
+    return replace(twin, parameters=tuple(replace(row, role=Role.ESTIMATED) for row in twin.parameters))
 
 
 def _delays(machine: LoadedMachine) -> list[str]:

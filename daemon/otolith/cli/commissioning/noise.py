@@ -224,7 +224,7 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
         uncertainty = f"± {2e3 * late_signal.sd:.2g} ms" if late_signal.sd is not None else ""
         line = f'{late_signal.name} = {{ delay = "{1e3 * late_signal.value:.4g} ms" }}'
         rows.append((line, "; ".join(filter(None, [uncertainty, late_signal.remark]))))
-    if late and machine.file.signals:
+    if late and machine.file.read_signals:
         yield "# under [signals], add the key delay to what is there:"
         yield from (f"# {line}" for line in _aligned(rows))
     elif late:
