@@ -279,7 +279,9 @@ def refuse_text(store: StateStore, content: bytes, reason: str) -> None:
     store.save_decisions(OperatorDecisions(approved=frozenset({UNBALANCE})))
     initial = fresh()
     state, note = store.restore(initial, START + 30.0)
-    assert state is initial
+    assert state.posterior is initial.posterior
+    assert replace(state.health, dropped=()) == initial.health
+    assert not state.health.dropped or json.loads(content)["machine"] == NAMES[0] == state.machine
     assert reason in note
     assert str(store.components_path) in note
     store.save(healthy())

@@ -151,7 +151,7 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
     for item in state.adopted:
         key = item.component.key
         if key in decisions.rejected or decisions.forgotten.get(key, -np.inf) > item.onset:
-            state = without_component(state, item.component)
+            state = _removed(state, item.component, "the operator removed the component")
     adopted = tuple(
         replace(item, approval=Approval.APPROVED if item.component.key in decisions.approved else Approval.OPEN)
         for item in state.adopted
@@ -168,7 +168,7 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
 def _reset(state: AdaptationState, name: str) -> AdaptationState:
     """Return the state without what was learned of a parameter, a component or everything; an open test is dropped."""
     if name == EVERYTHING:
-        return cleared(state)
+        return replace(cleared(state), health=state.health.without_learned("the operator reset what was learned"))
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}
@@ -178,12 +178,25 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
                 previous=previous,
                 test=None,
                 cusum=ParameterCusum(),
-                health=state.health.without_history(name),
+                health=state.health.without_history(name).without_events(
+                    {f"{kind}/{name}" for kind in ("limit", "trend", "lost")}, f"the operator reset {name}"
+                ),
             )
     for component in state.problem.components:
         if component.key == name:
-            return without_component(state, component)
+            return _removed(state, component, f"the operator reset {name}")
     return state
+
+
+def _removed(state: AdaptationState, component: Component, reason: str) -> AdaptationState:
+    """Return the state without a component, whose event is dropped unless another one is at the same place."""
+    state = without_component(state, component)
+    if any(
+        (item.component.site, item.component.family) == (component.site, component.family) for item in state.adopted
+    ):
+        return state
+    key = f"component/{component.site}/{component.family}"
+    return replace(state, health=state.health.without_events({key}, reason))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@
 Times are those of the windows. A window that determines nothing about a condition leaves it as it was.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -40,6 +40,7 @@ from otolith.health.schema import (
 )
 
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
+OF_DATA = ("data", "source/", "temperature/")  # Begins of the keys of conditions that nothing was learned for
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
 
 
@@ -81,6 +82,8 @@ class HealthState:
     doubtful: tuple[int, ...] = ()  # Indices of those of the last windows that contradicted what was known
     agreed: int = -1  # Index of the last window that agreed with it
     document: HealthDocument | None = None  # The states in the report before
+    dropped: tuple[EventDocument, ...] = ()
+    """Events that nothing is known of any more, each with its ``reason``; the next report clears them."""
 
     @property
     def open_events(self) -> tuple[EventDocument, ...]:
@@ -93,6 +96,34 @@ class HealthState:
         earlier = {key: item for key, item in self.earlier.items() if key != name}
         forecasts = {key: item for key, item in self.forecasts.items() if key != name}
         return replace(self, histories=histories, earlier=earlier, forecasts=forecasts)
+
+    def without_learned(self, reason: str) -> "HealthState":
+        """Return the state of a machine of which nothing was learned; events of what was learned are dropped."""
+        own = {key: record for key, record in self.records.items() if key.startswith(OF_DATA)}
+        lost = self.without_events(self.records.keys() - own.keys(), reason)
+        return HealthState(records=own, dropped=lost.dropped)
+
+    def without_events(self, keys: Collection[str], reason: str) -> "HealthState":
+        """Return the state without these conditions; what was learned of them is dropped for the ``reason``."""
+        records = {key: record for key, record in self.records.items() if key not in keys}
+        events = [record.event for key, record in self.records.items() if key in keys and record.event is not None]
+        return replace(self, records=records).with_dropped(events, reason)
+
+    def agreeing(self, published: Mapping[str, EventDocument], reason: str) -> "HealthState":
+        """Return the state with no other open events than were ``published``, by id the last change of each.
+
+        One that was cleared is open no more. One that is open, but not in this state, is dropped for the ``reason``.
+        """
+        own = {event.id for event in (*self.open_events, *self.dropped)}
+        cleared = {event.id for event in published.values() if event.end is not None}
+        records = {key: row for key, row in self.records.items() if row.event is None or row.event.id not in cleared}
+        lost = [event for event in published.values() if event.id not in own | cleared]
+        return replace(self, records=records).with_dropped(lost, reason)
+
+    def with_dropped(self, events: Iterable[EventDocument], reason: str) -> "HealthState":
+        """Return the state with events of another state that nothing is known of any more."""
+        dropped = tuple(event.model_copy(update={"reason": reason}) for event in events)
+        return replace(self, dropped=self.dropped + dropped)
 
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
@@ -118,11 +149,12 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
                 record = replace(record, event=None, cleared=report.window.index)
         if not record.is_over(report.window.index):
             records[key] = record
+    events += [_ended(plan, event, report.window.start) for event in state.dropped]
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None]
     document = _states(plan, state.document, report, current, state.undetermined)
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
-    state = replace(state, records=records, document=document, inside=state.inside | was_ok)
+    state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=())
     return state, report.model_copy(update={"health": document, "events": tuple(events)})
 
 
@@ -287,6 +319,13 @@ def _advance(
 def _until(event: EventDocument, now: float) -> EventDocument:
     """Return an event without a change, which began before ``now``: the clock may have been set back since."""
     return event.model_copy(update={"change": None, "start": min(event.start, now), "since": min(event.since, now)})
+
+
+def _ended(plan: MonitoringPlan, event: EventDocument, now: float) -> EventDocument:
+    """Return a dropped event as it is cleared."""
+    reason = plan.texts.translated(event.reason or "")
+    update = {"change": EventChange.CLEARED, "end": max(event.since, now), "reason": reason}
+    return event.model_copy(update={**update, "sequence": None, "previous": None})
 
 
 def _raised(

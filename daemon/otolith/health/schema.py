@@ -144,7 +144,8 @@ class EventDocument(DocumentModel):
     cause: str = ""
     advice: str = ""
     source: str = ""
-    language: Language = "en"  # Of condition, text, cause and advice
+    reason: str | None = None  # Why it is cleared although nothing shows that it is over: its learned state was dropped
+    language: Language = "en"  # Of condition, text, cause, advice and reason
     evidence: EvidenceDocument
 
     @property

@@ -169,7 +169,8 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text)
     texts = texts_in(event.language)
     part, condition = texts.translated(event.part), event.condition
     if event.end is not None:
-        return texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
+        line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
+        return f"{line}; {texts('dropped', reason=event.reason)}" if event.reason else line
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     advice = f"; {event.advice}" if event.advice else ""
     state, since = texts.translated(event.state), when(event.since)

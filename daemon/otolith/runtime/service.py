@@ -269,6 +269,9 @@ class Service:
         if self._history is not None:
             self._numbers, note = self._history.open(time.time())
             self._notes += (note,) if note else ()
+            state, reason = self._supervisor.state, "its state was not saved before the daemon ended"
+            health = state.health.agreeing(self._history.last_changes(), reason)
+            self._supervisor.state = replace(state, health=health)
             self._history.start()
 
     def _reload(self) -> None:

@@ -36,6 +36,7 @@ RESOLUTIONS = {WINDOW: "window", MINUTE: "minute", HOUR: "hour", DAY: "day"}
 BUSY_TIMEOUT = 2.0  # s to wait for another process that reads or writes
 CHECKPOINT_BYTES = 1 << 20  # of the write-ahead log, after which it is merged
 COMPRESSION = 1  # level of zlib
+LATEST_CHANGES = 2000  # changes of events that are searched for those that were left open
 FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
 
 _SAMPLE = """
@@ -233,6 +234,14 @@ class HistoryReader:
     def event_ends(self, since: float) -> dict[int, float]:
         """Return the end of the window of each change of an event since a time, by its sequence number."""
         return dict(self._rows("SELECT sequence, time FROM event WHERE time >= ?", since))
+
+    def last_changes(self) -> dict[str, EventDocument]:
+        """Return the last change of each event by its id, the latest first, among ``LATEST_CHANGES`` changes."""
+        rows = self._rows("SELECT text FROM event ORDER BY sequence DESC LIMIT ?", LATEST_CHANGES)
+        changes: dict[str, EventDocument] = {}
+        for event in self._undamaged(rows, EventDocument.model_validate_json):
+            changes.setdefault(event.id, event)
+        return changes
 
     def findings(self, since: float) -> list[dict[str, Any]]:
         """Return the findings since a time: ``first``, ``last``, ``count`` of windows, and the latest document."""

@@ -251,6 +251,16 @@ class HistoryWriter(WriterThread):
                 self._written.clear()
         self._wakeup.set()
 
+    def last_changes(self) -> dict[str, EventDocument]:
+        """Return what :meth:`HistoryReader.last_changes` does; nothing without a database."""
+        if self._connection is None:
+            return {}
+        try:
+            return self.reader.last_changes()
+        except OtolithError as error:
+            self.fail(error)
+            return {}
+
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
     ) -> list[str]:

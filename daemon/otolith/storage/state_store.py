@@ -9,7 +9,7 @@ import logging
 import os
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
@@ -75,6 +75,8 @@ class StateStore:
         self._signal_fingerprint = signal_fingerprint
         folder = folder or state_directory() / "components"
         self.components_path = folder / f"{site}.{machine}.json"
+        self.earlier_path = folder / f"{site}.{machine}.earlier.json"
+        """What was saved before, for when the newest file is damaged."""
         self.decisions_path = folder / f"{site}.{machine}.decisions.json"
         self.lock_path = folder / f"{site}.{machine}.lock"
         self._lock: int | None = None
@@ -147,7 +149,13 @@ class StateStore:
         return {} if learned is None else dict(learned.health.histories)
 
     def _learned(self) -> LearnedState | None:
-        learned = _read(self.components_path, LearnedState, VERSION)
+        try:
+            learned = _read(self.components_path, LearnedState, VERSION)
+        except ConfigurationError as error:
+            if not self.earlier_path.exists():
+                raise
+            log.warning("%s; used is what was saved before it", error)
+            learned = _read(self.earlier_path, LearnedState, VERSION)
         if learned is not None and (reason := self._other_origin(learned)):
             log.warning("%s: not used: %s", self.components_path, reason)
             return None
@@ -166,28 +174,46 @@ class StateStore:
     def restore(self, state: AdaptationState, now: float) -> tuple[AdaptationState, str]:
         """Return the initial ``state`` with what was saved, and why not all of it was used; empty if it was.
 
-        A file that is not used as a whole is kept under another name. Requires the lock; ``now`` in Unix s.
+        A file that is not used as a whole is kept under another name. If it is damaged, what was saved before it is
+        used. Events of a state that is not used are dropped. Requires the lock; ``now`` in Unix s.
         """
-        warm, reason = state, ""
-        try:
-            learned = _read(self.components_path, LearnedState, VERSION)
-            if learned is None:
-                return state, ""
-            reason = self._other_origin(learned)
-            if not reason:
-                if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
-                    reason = "parameters or noise in the machine file have changed since it was saved"
-                    learned = learned.model_copy(update={"filter": None})
-                warm = restored(learned, state, now)
-        except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
-            reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
+        warm, reason, is_damaged = self._restored(state, now)
         if not reason:
             return warm, ""
         note = f"{self.components_path}: {'only components are used' if warm.adopted else 'not used'}: {reason}"
         try:
-            return warm, f"{note}; the file is kept as {self.set_aside().name}"
+            note = f"{note}; the file is kept as {self.set_aside().name}"
         except OtolithError as error:
             return warm, f"{note}; {error}"
+        if not is_damaged or not self.earlier_path.exists():
+            return warm, note
+        try:
+            self.earlier_path.rename(self.components_path)
+        except OSError as error:
+            return warm, f"{note}; {self.earlier_path}: cannot be renamed: {error.strerror}"
+        saved = datetime.fromtimestamp(self.components_path.stat().st_mtime, UTC)
+        warm, other = self.restore(state, now)
+        return warm, f"{note}; {other or f'used is what was saved before it, at {saved:%F %T} UTC'}"
+
+    def _restored(self, state: AdaptationState, now: float) -> tuple[AdaptationState, str, bool]:
+        """Return the state with what was saved, why not all of it is used, and whether the file is damaged."""
+        try:
+            learned = _read(self.components_path, LearnedState, VERSION)
+            if learned is None:
+                return state, "", False
+            if reason := self._other_origin(learned):
+                if (learned.machine, learned.site) != (self._machine, self._site):
+                    return state, reason, False
+                events = (*learned.health.dropped, *learned.health.open_events)
+                health = state.health.with_dropped(events, f"what was learned is not used: {reason}")
+                return replace(state, health=health), reason, False
+            if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
+                reason = "parameters or noise in the machine file have changed since it was saved"
+                learned = learned.model_copy(update={"filter": None})
+            return restored(learned, state, now), reason, False
+        except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
+            reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
+            return state, reason, True
 
     def set_aside(self) -> Path:
         """Rename the file with what was learned, keep the newest such; raise ServiceError if it cannot be renamed."""
@@ -233,8 +259,25 @@ class StateStore:
     def _write_learned(self, learned: LearnedState) -> None:
         if self._is_blocked:
             raise ServiceError(f"{self.components_path}: not overwritten: it was refused and could not be renamed")
-        with self.locked():
+        with self.locked(), self._earlier_kept():
             _write(self.components_path, learned, f"{self.components_path.name}.new")
+
+    @contextlib.contextmanager
+    def _earlier_kept(self) -> Iterator[None]:
+        """Give the present file a second name, under which it stays once it is replaced."""
+        second = self.earlier_path.with_name(f"{self.earlier_path.name}.new")
+        try:
+            second.unlink(missing_ok=True)
+            os.link(self.components_path, second, follow_symlinks=False)
+        except OSError as error:  # nothing was saved yet, or a file system without links: the newest is more important
+            log.debug("%s: %s", self.earlier_path, error)
+        try:
+            yield
+            with contextlib.suppress(FileNotFoundError):
+                second.replace(self.earlier_path)
+        finally:
+            with contextlib.suppress(OSError):
+                second.unlink()
 
     def decisions(self) -> OperatorDecisions:
         """Return the operator's decisions; raise ConfigurationError if the file is unreadable or damaged."""

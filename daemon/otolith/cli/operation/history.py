@@ -174,7 +174,7 @@ def _print_samples(samples: "Iterable[HistorySample]") -> None:
 
 
 def _print_events(events: "Iterable[EventDocument]") -> None:
-    columns = ("change", "part", "state", "condition", "cause", "text", "advice", "id")
+    columns = ("change", "part", "state", "condition", "cause", "text", "advice", "id", "reason")
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(("time", *columns))
     for event in events:
