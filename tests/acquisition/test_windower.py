@@ -14,6 +14,7 @@ from otolith.acquisition.window import Verdict, Window
 from otolith.acquisition.windower import GRACE_PERIOD, Windower
 from otolith_drivers.base import Sample, Sampling
 from tests.acquisition.series import ramp
+from tests.messages import assert_each_says
 
 PERIOD, RECORDS = 0.01, 50
 LIMITS = QualityLimits(missing=0.05, gap=0.05)
@@ -98,9 +99,7 @@ def test_windows_are_bad_during_an_outage_and_good_after() -> None:
     assert verdicts[:4] == [Verdict.GOOD] * 4
     assert verdicts[4:7] == [Verdict.BAD] * 3
     assert verdicts[7:11] == [Verdict.GOOD] * 4
-    assert windows[5].quality.reasons == (
-        "no samples of a, b from t = 1002.50 s for 0.5 s: is the source on, and is its signal right in [signals]?",
-    )
+    assert_each_says(windows[5].quality.reasons, ("a, b", "1002.50 s", "0.5 s", "source", "[signals]"))
 
 
 def test_a_silent_machine_gives_bad_windows() -> None:

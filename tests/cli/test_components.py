@@ -29,6 +29,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import state_directory
 from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES
+from tests.messages import raises_saying
 
 KEY = "shaft/periodic/angle(omega)"
 STDOUT, STDERR = "standard output", "standard error"
@@ -249,7 +250,7 @@ def test_reset_records_what_to_forget_and_keeps_decisions() -> None:
 
 
 def test_reset_of_an_unknown_name_names_the_nearest() -> None:
-    with pytest.raises(ConfigurationError, match="no parameter or component 'R_b': did you mean 'R_a'"):
+    with raises_saying(ConfigurationError, "'R_b'", "'R_a'"):
         otolith("reset", MACHINE, "R_b")
 
 

@@ -25,6 +25,7 @@ from otolith.runtime.preview import EvenSpread
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, recorded, written
+from tests.messages import assert_says, raises_saying
 
 
 @pytest.fixture
@@ -89,13 +90,13 @@ def test_a_late_signal_is_printed_with_its_delay(tmp_path: Path) -> None:
 def test_data_without_a_usable_window_is_refused(tmp_path: Path, scenario: MotorScenario) -> None:
     rows = recorded(scenario)
     short = written(tmp_path, rows[:100])
-    with pytest.raises(ConfigurationError, match="no window of 2 s can be used: the data is too short"):
+    with raises_saying(ConfigurationError, "2 s", "too short"):
         noise(MACHINE, short)
     nearly_empty = written(tmp_path, [row if index < 3 else [row[0], "", "", "", ""] for index, row in enumerate(rows)])
     with pytest.raises(ConfigurationError, match="badly sampled"):
         noise(MACHINE, nearly_empty)
     empty = written(tmp_path, [[row[0], "", "", "", ""] for row in rows])
-    with pytest.raises(ConfigurationError, match=r"no window of 2 s can be used: .*no samples"):
+    with raises_saying(ConfigurationError, "2 s", "no samples"):
         noise(MACHINE, empty)
 
 
@@ -138,7 +139,7 @@ def test_a_structure_at_a_bound_is_printed_and_not_offered() -> None:
     structure = [Structure(component, 0.05, 0.03, 500.0, is_restarted=False, is_at_bound=True)]
     lines = list(structure_lines(machine, structure))
     assert lines[0].startswith("# structure: shaft/power/omega: -0.5·omega^0.3 N*m")
-    assert lines[1] == "# its exponent lies at a bound of the search, so its shape is not known: not offered"
+    assert_says(lines[1], "# ", "exponent", "bound", "not offered")
     assert not any("commission" in line for line in lines)
     record = HealthyRecord(IdentifiedDelays(()), IdentifiedNoise((), (), ()), structure, ())
     assert record.offered == []

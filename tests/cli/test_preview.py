@@ -17,6 +17,7 @@ from otolith.runtime.replay import open_recorded
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Reader
 from tests.cli.replays import MACHINE, Lines, recorded, written
+from tests.messages import assert_says
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ def test_a_gap_is_shown_with_length_and_place(tmp_path: Path, rows: Lines) -> No
     text = "\n".join(preview_lines(preview))
     assert row_of(text, "i [A]")[6:9] == ["1", "3.01", "s"]
     (remark,) = [remark for remark in preview.remarks if "gap" in remark]
-    assert remark == "V_a, T_load, i, omega: the longest gap is 3.01 s, from t = 6.99 s to line 702"
+    assert_says(remark, "V_a, T_load, i, omega", "3.01 s", "6.99 s", "line 702")
 
 
 def test_rows_that_come_twice_and_steps_back_are_counted(tmp_path: Path, rows: Lines) -> None:
@@ -231,7 +232,7 @@ def test_the_short_preview_reads_only_the_beginning(
     assert 450 < preview.rows < 1000
     lines = list(short_lines(preview))
     assert lines[0].strip().startswith(f"{preview.rows} rows of data.csv: V_a, T_load")
-    assert lines[-1].strip() == "not examined: a better window, the computing time; 'otolith check' does so"
+    assert_says(lines[-1], "not examined", "window", "computing time", "'otolith check'")
 
 
 def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_short(

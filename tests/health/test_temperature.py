@@ -22,6 +22,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import Drift
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
+from tests.messages import raises_saying
 
 COPPER, RISE, WINDOWS = 0.00393, 40.0, 60  # 1/K, K
 PERIOD, RECORDS = 0.01, 200
@@ -164,5 +165,5 @@ def test_a_wrong_temperature_is_refused(own_machine: OwnMachine, extra: str, mes
 
 def test_a_temperature_without_a_signal_is_refused(own_machine: OwnMachine) -> None:
     machine_with(own_machine, MEASURED)
-    with pytest.raises(ConfigurationError, match=r"winding_temperature \(K\) is missing: \[parameters\] names it"):
+    with raises_saying(ConfigurationError, "winding_temperature (K)", "missing", "[parameters]"):
         load_machine(own_machine.machine)

@@ -27,6 +27,7 @@ from otolith.storage.state_store import StateStore, StateWriter
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import writable
 from tests.cli.replays import MACHINE
+from tests.messages import raises_saying
 from tests.waiting import PATIENCE, wait_for, within
 
 FRICTION = Component("shaft", "Coulomb", "omega", -0.004, inner=0.1, low=0.05, high=1.0)
@@ -218,7 +219,7 @@ def test_who_finds_another_process_in_the_place_of_its_lock_writes_nothing(store
 def test_a_lock_file_that_is_a_link_is_refused(store: StateStore, tmp_path: Path) -> None:
     store.lock_path.parent.mkdir()
     store.lock_path.symlink_to(tmp_path / "other")
-    with pytest.raises(ServiceError, match=r"cannot be locked: .*, as it is a link: move it away"):
+    with raises_saying(ServiceError, "locked", "link", "move it away"):
         store.lock()
     assert not (tmp_path / "other").exists()
 
@@ -229,23 +230,23 @@ def test_a_state_of_another_user_is_named_with_the_way_out(store: StateStore, mo
         pass
     monkeypatch.setattr(os, "geteuid", lambda: store.lock_path.stat().st_uid + 1)
     monkeypatch.setattr(os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
-    with pytest.raises(ServiceError, match=r"Permission denied, as it belongs to user .*: run 'chown --recursive"):
+    with raises_saying(ServiceError, "Permission denied", "belongs to user", "chown --recursive"):
         store.lock()
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(ServiceError, match=r"not writable for this user, as it belongs to user .*: run 'chown"):
+    with raises_saying(ServiceError, "not writable", "belongs to user", "chown"):
         writable(store.lock_path.parent)
 
 
 def test_a_file_in_the_place_of_a_folder_is_named(store: StateStore) -> None:
     store.lock_path.parent.touch()
-    with pytest.raises(ServiceError, match=r"components: a file, not a folder: move it away"):
+    with raises_saying(ServiceError, "components", "not a folder", "move it away"):
         store.lock()
 
 
 def test_a_folder_in_the_place_of_a_temporary_file_is_named(store: StateStore) -> None:
     store.save(STATE)
     (store.components_path.parent / f"{store.components_path.name}.new").mkdir()
-    with pytest.raises(ServiceError, match=r"here\.motor\.json\.new beside it is a folder: remove or"):
+    with raises_saying(ServiceError, "here.motor.json.new", "folder", "remove"):
         store.save(with_friction(-0.001))
     assert store.components() == SAVED
 

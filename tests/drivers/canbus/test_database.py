@@ -13,7 +13,7 @@ from otolith_drivers.canbus.options import CanSource, request_from_databases
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import dbc, decoder, frame, values
-from tests.messages import assert_refuses
+from tests.messages import assert_refuses, raises_saying
 from tests.waiting import within
 
 DBC = EXAMPLES / "dc-motor.dbc"
@@ -110,7 +110,7 @@ def test_huge_files_and_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_eds_given_as_dbc_is_refused_with_the_way_out() -> None:
-    with pytest.raises(ConfigurationError, match=r'not a CAN database: set eds = "\.\.\." in \[driver\]'):
+    with raises_saying(ConfigurationError, "not a CAN database", 'eds = "..."', "[driver]"):
         load_database(EXAMPLES / "canopen-drive.eds")
 
 
@@ -132,7 +132,7 @@ def test_overlap_is_an_error_only_for_requested_signals(tmp_path: Path) -> None:
     assert "warning: drive.dbc: Other.Two and Other.One overlap" in frame_decoder.describe()
     assert values(frame_decoder.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
     decoder(tmp_path, {"U": ("V", {"signal": "Three"})}, text)  # the message is faulty, but not where it is read
-    with pytest.raises(ConfigurationError, match=r"Other.Two and Other.One overlap: read it by 'id'"):
+    with raises_saying(ConfigurationError, "Other.Two", "Other.One", "overlap", "'id'"):
         decoder(tmp_path, {"U": ("V", {"signal": "One"})}, text)
 
 
@@ -154,7 +154,7 @@ def test_warnings_of_a_faulty_database_are_limited(tmp_path: Path) -> None:
 
 def test_a_frame_described_twice_needs_the_message(tmp_path: Path) -> None:
     text = dbc(MOTOR, 'BO_ 385 Rival: 8 Drive\n SG_ Power : 0|16@1- (1,0) [0|0] "W" Monitor')
-    with pytest.raises(ConfigurationError, match="frame 0x181 is both Motor and Rival: set 'message' to the right one"):
+    with raises_saying(ConfigurationError, "0x181", "Motor", "Rival", "'message'"):
         decoder(tmp_path, SPEED, text)
     frame_decoder = decoder(tmp_path, {"omega": ("rad/s", {"signal": "Speed", "message": "Motor"})}, text)
     assert "warning: drive.dbc: frame 0x181 is described 2 times: Motor, Rival" in frame_decoder.describe()
@@ -162,7 +162,7 @@ def test_a_frame_described_twice_needs_the_message(tmp_path: Path) -> None:
 
 def test_a_name_in_two_messages_needs_the_message(tmp_path: Path) -> None:
     text = dbc(MOTOR, MOTOR.replace("385 Motor", "386 Motor2"))
-    with pytest.raises(ConfigurationError, match="is in Motor, Motor2: set 'message' beside it"):
+    with raises_saying(ConfigurationError, "Motor, Motor2", "'message'"):
         decoder(tmp_path, SPEED, text)
 
 

@@ -8,6 +8,7 @@ from otolith_drivers.canbus.database import load_database, load_dbc
 from otolith_drivers.canbus.probe import Picture
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame, values
+from tests.messages import raises_saying
 
 NESTED = """BO_ 258 Mux: 8 Drive
  SG_ VeryLongNameOfTheOuterMultiplexer M : 0|8@1+ (1,0) [0|0] "" Monitor
@@ -34,7 +35,7 @@ VOLTS, PLAIN = {"U": ("V", {"signal": "Volts"})}, {"U": ("V", {"signal": "Plain"
 )
 def test_signal_without_its_multiplexer_is_an_error_only_if_requested(tmp_path: Path, text: str) -> None:
     """It would otherwise be read from frames that do not contain it."""
-    with pytest.raises(ConfigurationError, match=r"Mux\.Volts is multiplexed by .*: read it by 'id'"):
+    with raises_saying(ConfigurationError, "Mux.Volts", "multiplexed", "'id'"):
         decoder(tmp_path, VOLTS, text)
     frame_decoder = decoder(tmp_path, PLAIN, text)
     assert any("Mux.Volts is multiplexed by" in line for line in frame_decoder.describe())

@@ -17,6 +17,7 @@ from otolith_drivers.canbus.monitoring import COUNTER_NAMES, OTHER_COUNTER_NAMES
 from otolith_drivers.common.message_times import PeriodEstimator
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame
+from tests.messages import assert_each_says
 
 PERIOD = 0.01
 MOTOR = dbc(
@@ -186,7 +187,7 @@ def test_a_stuck_counter_delivers_nothing_and_is_a_warning(tmp_path: Path) -> No
     given = [send(frame_decoder, index, count=49) for index in range(50, 60)]
     assert given == [0] * 10
     assert (frame_decoder.counters.received, frame_decoder.counters.bad, frame_decoder.counters.lost) == (100, 10, 0)
-    assert frame_decoder.warnings(0.6) == ["the counter AliveCounter of Motor (0x181) has not changed for 10 frames"]
+    assert_each_says(frame_decoder.warnings(0.6), ("AliveCounter", "Motor (0x181)", "10 frames"))
     send_all(frame_decoder, range(60, 61))
     assert frame_decoder.warnings(0.61) == []
     assert frame_decoder.counters.lost == 2 * 10  # the repeated frames replaced new ones
@@ -254,7 +255,7 @@ def test_frames_with_a_wrong_checksum_are_bad(tmp_path: Path, kind: str) -> None
         samples = frame_decoder.decode(frame(385, bytes(data)), index * PERIOD)
         assert len(samples) == (0 if index in (5, 6) else 2)
     assert (frame_decoder.counters.received, frame_decoder.counters.bad, frame_decoder.counters.lost) == (36, 2, 0)
-    assert frame_decoder.warnings(0.2) == ["Motor (0x181): a frame with a wrong checksum; 2 in all, the last 0.1 s ago"]
+    assert_each_says(frame_decoder.warnings(0.2), ("Motor (0x181)", "checksum", "2 ", "0.1 s"))
 
 
 def test_checksums_have_the_published_check_values() -> None:
@@ -305,7 +306,7 @@ def test_silence_warning_gives_the_period(tmp_path: Path) -> None:
     frame_decoder = motor(tmp_path)
     send_all(frame_decoder, range(100))
     assert frame_decoder.warnings(1.4) == []
-    assert frame_decoder.warnings(0.99 + 3.2) == ["Motor (0x181) silent for 3.2 s; it came every 10.0 ms"]
+    assert_each_says(frame_decoder.warnings(0.99 + 3.2), ("Motor (0x181)", "silent", "3.2 s", "10.0 ms"))
     send_all(frame_decoder, range(419, 421))
     assert frame_decoder.warnings(4.21) == []
 
@@ -314,16 +315,16 @@ def test_silence_warning_before_the_period_is_known(tmp_path: Path) -> None:
     frame_decoder = motor(tmp_path)
     send_all(frame_decoder, range(3))
     assert frame_decoder.warnings(5.0) == []
-    assert frame_decoder.warnings(12.02) == ["Motor (0x181) silent for 12.0 s; its period is not known"]
+    assert_each_says(frame_decoder.warnings(12.02), ("Motor (0x181)", "silent", "12.0 s", "period"))
 
 
 def test_a_message_that_never_comes_is_a_warning(tmp_path: Path) -> None:
     frame_decoder = motor(tmp_path)
     assert frame_decoder.warnings(2.0) == []
-    assert frame_decoder.warnings(4.0) == ["Motor (0x181) has not come once in 4.0 s"]
+    assert_each_says(frame_decoder.warnings(4.0), ("Motor (0x181)", "not", "4.0 s"))
     cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 385 900;'
     seldom = decoder(tmp_path, WISHES, MOTOR + cycle)
     assert (seldom.warnings(0.0), seldom.warnings(8.9), len(seldom.warnings(9.1))) == ([], [], 1)
     slow = motor(tmp_path, messages={"Motor": {"period": "2 s"}})
     assert slow.warnings(19.0) == []
-    assert slow.warnings(21.0) == ["Motor (0x181) has not come once in 21.0 s"]
+    assert_each_says(slow.warnings(21.0), ("Motor (0x181)", "not", "21.0 s"))

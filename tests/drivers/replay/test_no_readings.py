@@ -11,6 +11,7 @@ from otolith_drivers.base import Setup, Signal
 from otolith_drivers.replay.cleaning import NoReadings, is_sentinel_number
 from otolith_drivers.replay.readers import Array, Reader
 from otolith_drivers.replay.tables import TableReader, TableSource, open_log
+from tests.messages import assert_each_says, assert_says
 
 SENTINELS = [-999.0, -9999.0, 9999.9, -999.25, 32767.0, -32768.0, 65535.0, 2147483647.0, 1e30, -9.969e36]
 PWM, SUPPLY = (0.0, 65535.0), (-24.0, 24.0)
@@ -53,7 +54,7 @@ def test_a_stated_range_replaces_the_search_for_sentinels() -> None:
     values[10], values[20] = -9999.0, 36.0
     column = NoReadings(stated=(-1e4, 35.5))
     assert np.flatnonzero(column.among(values)).tolist() == [20]
-    assert column.warnings("i") == ["i: 1 cell beyond its range [-10000.0, 35.5], left out"]
+    assert_each_says(column.warnings("i"), ("i: ", "1 cell", "[-10000.0, 35.5]", "left out"))
 
 
 def blanks(reader: Reader, name: str) -> list[int]:
@@ -115,7 +116,7 @@ def test_a_table_has_neither_sentinels_nor_numbers_beyond_a_range(tmp_path: Path
     with open_log(path, Setup(signals, tmp_path, 0.01)) as reader:
         assert blanks(reader, "omega") == [7, 9]
     omega, voltage = reader.warnings()
-    assert omega == "omega: 2 cells beyond its range [-50.0, 50.0], left out"
+    assert_says(omega, "omega", "2 cells", "[-50.0, 50.0]", "left out")
     assert "V_a: -9999999 in 1 cell is no reading" in voltage
     assert reader.bad == 0
     with TableReader(path, {"omega": "rad/s"}, {"omega": TableSource(column="n")}) as reader:

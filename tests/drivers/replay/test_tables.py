@@ -12,6 +12,7 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay import tables
 from otolith_drivers.replay.readers import Rows
 from otolith_drivers.replay.tables import MAX_PREAMBLE, TableReader, TableSource
+from tests.messages import raises_saying
 
 
 def read(path: Path, sources: dict[str, TableSource] | None = None) -> tuple[list[Rows], TableReader]:
@@ -125,7 +126,7 @@ def test_times_may_be_dates(tmp_path: Path, written: str, heading: str) -> None:
 def test_dates_that_leave_open_the_day_are_refused(tmp_path: Path, written: str) -> None:
     path = tmp_path / "table.csv"
     path.write_text(f"t,x\n{written},1.5\n", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"table.csv:2: t is .*write seconds, relative or Unix, a date like"):
+    with raises_saying(ConfigurationError, "table.csv:2", "t is ", "seconds", "Unix", "date"):
         read(path)
 
 
@@ -189,7 +190,7 @@ def test_a_unit_that_is_not_known_is_refused_where_the_others_are_units(tmp_path
     path = tmp_path / "table.csv"
     path.write_text("t,i,omega,x\ns,mA,rpm,Frobs\n0,1500,60,1\n", encoding="utf-8")
     units = {"i": "A", "omega": "rad/s", "x": "V"}
-    with pytest.raises(ConfigurationError, match=r"table.csv:1: column 4 \('x'\): 'Frobs' is not a unit"):
+    with raises_saying(ConfigurationError, "table.csv:1", "column 4", "'x'", "'Frobs'"):
         TableReader(path, units)
     with TableReader(path, units, {"x": TableSource(unit="V")}) as reader:
         assert numbers(list(reader.chunks())) == [1.0]
@@ -235,7 +236,7 @@ def test_whole_numbers_with_separated_thousands_are_refused(tmp_path: Path, sepa
     cells = [f'"{number:,}"'.replace(",", sign) for number in range(980, 1020)]
     rows = [f"{index}{separator}{cell}" for index, cell in enumerate(cells)]
     path.write_text("\n".join([f"t{separator}x", *rows]) + "\n", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=rf"'1\{sign}000' may be 1000 or .*: export without separated thou"):
+    with raises_saying(ConfigurationError, f"'1{sign}000'", "1000 ", "thousands"):
         read(path)
     path.write_text("\n".join([f"t{separator}x", *rows, f'40{separator}"0{sign}5"']) + "\n", encoding="utf-8")
     assert numbers(read(path)[0])[-1] == 0.5
@@ -244,7 +245,7 @@ def test_whole_numbers_with_separated_thousands_are_refused(tmp_path: Path, sepa
 def test_the_decimal_sign_is_named_where_a_cell_has_the_other(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("t;x\n0.0;1,5\n0.1;1,6\n", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"csv:2: t is '0.0', but ',' is the decimal sign of other cells"):
+    with raises_saying(ConfigurationError, "csv:2", "'0.0'", "','", "decimal sign"):
         read(path)
     path.write_text("t;x\n0;1,5\n1;1,6\n2;1.6\n", encoding="utf-8")
     assert "line 4: x is '1.6', but ',' is the decimal sign of other cells" in read(path)[1].warnings()[0]
@@ -278,7 +279,7 @@ def test_lines_above_the_header_are_passed_over(tmp_path: Path) -> None:
 def test_what_is_missing_is_named_in_the_line_with_most_names(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("Model,XY4054\n\nTIME,CH1,CH2\n0.00,1.5,2\n0.01,2.5,3\n", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"table.csv:3: no column 'x' \(1\): known: CH1, CH2"):
+    with raises_saying(ConfigurationError, "table.csv:3", "'x'", "CH1, CH2"):
         read(path)
 
 
