@@ -8,21 +8,26 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from otolith_drivers.errors import ConfigurationError, nearest, shown
+from otolith_drivers.outside_text import visible
+from otolith_drivers.toml_bounds import MAX_TEXT, depth_fault, text_faults
 
 FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times the largest machine file
+MAX_FAULTS = 20  # lines of an error: engineering choice, more than a person mends at once
+SHOWN_KEY = 64  # characters of a key in an error
 
 Location = Sequence[int | str]  # Keys and list indices that lead to a value
 Model = TypeVar("Model", bound=BaseModel)
 
 NUMBER = (int, float)  # A boolean is an integer as well
-SECTION = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$")
-ASSIGNMENT = re.compile(r"\s*([\w\-.\"' ()]+?)\s*=")
+SECTION = re.compile(r"\s*+(\[\[?)([^\]]++)\]\]?\s*+(?:#.*)?$")
+ASSIGNMENT = re.compile(r"\s*+([\w\-.\"' ()\t]++)=")
 KEY_PART = re.compile(r"\"[^\"]*\"|'[^']*'|[^.]+")
 TOML_TYPES = {
     "tuple_type": "a list, in [ ]",
@@ -78,13 +83,10 @@ class StrictModel(DocumentModel):
     @model_validator(mode="before")
     @classmethod
     def _of_the_written_types(cls, table: object) -> object:
-        """Refuse what pydantic converts (a boolean for a number, a number for a boolean), and zero bytes."""
+        """Refuse what pydantic converts: a boolean for a number, a number for a boolean."""
         kinds = _written_kinds(cls)
         for key, value in table.items() if isinstance(table, dict) else ():
-            if isinstance(value, str):
-                if "\0" in value:
-                    raise _ValueFaultError(key, f"{value!r} contains a zero byte")
-            elif isinstance(value, NUMBER) and key in kinds:
+            if isinstance(value, NUMBER) and key in kinds:
                 _check_number(key, value, kinds[key])
         return table
 
@@ -191,12 +193,17 @@ def read(path: Path, key: tuple[str, ...] = ()) -> SourceFile:
 
 
 def parse(file: SourceFile) -> dict[str, Any]:
-    """Return the tables of a TOML file; raise ConfigurationError if it is none."""
+    """Return the tables of a TOML file; raise ConfigurationError if it is none, or beyond the bounds of one."""
+    if fault := depth_fault(file.text):
+        raise ConfigurationError(f"{file.path}:{fault}")
     try:
-        return tomllib.loads(file.text)
+        data = tomllib.loads(file.text)
     except (ValueError, RecursionError) as error:
         hint = "; a key may occur only once in its table" if "overwrite" in str(error) else ""
-        raise ConfigurationError(f"{file.path}: not valid TOML: {error}{hint}") from error
+        raise ConfigurationError(f"{file.path}: not valid TOML: {visible(str(error), MAX_TEXT)}{hint}") from error
+    if faults := list(islice(text_faults(data), MAX_FAULTS)):
+        raise ConfigurationError("\n".join(f"{file.place(at)}: {message}" for at, message in faults))
+    return data
 
 
 def expect(file: SourceFile, data: dict[str, Any], key: str) -> None:
@@ -211,7 +218,10 @@ def validate(data: Any, model: type[Model], file: SourceFile, under: Location = 
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [f"{file.place([*under, *at])}: {message}" for at, message in _faults(error, data, model)]
+        faults = list(_faults(error, data, model))
+        lines = [f"{file.place([*under, *at])}: {message}" for at, message in faults[:MAX_FAULTS]]
+        if len(faults) > MAX_FAULTS:
+            lines.append(f"{file.path}: {len(faults) - MAX_FAULTS} more faults: mend these first")
         raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
 
 
@@ -226,7 +236,8 @@ def validated(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
 
 def dotted(location: Location) -> str:
     """Return ``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
-    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".") or "the file"
+    parts = (f"[{key}]" if isinstance(key, int) else f".{visible(key, SHOWN_KEY)}" for key in location)
+    return "".join(parts).lstrip(".") or "the file"
 
 
 def line_of(text: str, location: Location) -> int | None:
@@ -266,9 +277,9 @@ def _faults(error: ValidationError, data: Any, model: type[BaseModel]) -> Iterat
         cause = fault.get("ctx", {}).get("error")
         location = (*fault["loc"], cause.key) if isinstance(cause, _ValueFaultError) else fault["loc"]
         faults.setdefault(_written(data, location, is_missing=fault["type"] == "missing"), fault)
+    tables = {at[:depth] for at in faults for depth in range(len(at))}
     for at, fault in faults.items():
-        # A table that fails because of its content adds nothing to the fault of the content.
-        if not any(len(other) > len(at) and other[: len(at)] == at for other in faults):
+        if at not in tables:  # a table that fails because of its content adds nothing to the fault of the content
             yield at, _message(dict(fault), at, model)
 
 

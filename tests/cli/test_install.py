@@ -186,9 +186,9 @@ def test_the_service_accepts_packets_from_the_networks_of_its_readers_alone(file
     text = (tmp_path / "etc/systemd/system/otolith@press-3.service.d/machine.conf").read_text(encoding="utf-8")
     assert "IPAddressDeny=any\nIPAddressAllow=localhost\n" in text
     assert text.endswith("IPAddressAllow=192.168.7.0/24\nIPAddressAllow=fd00::/8\n")
-    assert "# No IPAddressDeny: the addresses that drive " in drop_in(
-        "press-3", [{"type": "modbus", "host": "drive"}], ("tcp/0.0.0.0:7447",), (), networks=("192.168.7.0/24",)
-    )
+    driver = {"type": "modbus", "host": "drive"}
+    text = drop_in("press-3", [driver], ("tcp/0.0.0.0:7447",), (), networks=("192.168.7.0/24",))
+    assert re.search("# No IPAddressDeny.*'drive'", text)
 
 
 @pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])

@@ -55,7 +55,7 @@ FAULTS = [
     ("name = 'x'\ninner = { speed = true }\n", "2: inner.speed: true is a boolean: write a number"),
     ("name = 'x'\nchoice = true\n", "2: choice: true is a boolean: write a number"),
     ("name = 'x'\nswitch = 0\n", "2: switch: 0 is a number: write true or false"),
-    ('name = "\\u0000"\n', "1: name: '\\x00' contains a zero byte"),
+    ('name = "\\u0000"\n', "1: name: the text has the control character U+0000"),
     ("name = 'x'\nfolder = 1\n", "2: folder: 1: must be a text, in quotes"),
     ("name = 'x'\nquantity = [1]\n", "2: quantity: [1]: the value should be a valid number"),
     (f"name = 'x'\nquantity = {[1] * 999}\n", "1,...: the value should be a valid number"),

@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,8 @@ from urllib.parse import urlsplit
 import click
 
 from otolith.cli.common import MACHINE_FILE, shipped_directory
-from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith.cli.operation.unit_file import addresses, comment, directive
+from otolith_drivers.errors import ConfigurationError, ServiceError, shown, some_names
 
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
@@ -105,8 +105,10 @@ def _files(file: Path) -> Iterator[InstalledFile]:
 
 def named_files(file: Path) -> list[Path]:
     """Return the files that a machine file names, relative to it; raise ConfigurationError if one is elsewhere."""
+    from otolith_drivers.config_files import parse, read
+
     names = []
-    for text in _strings(tomllib.loads(file.read_text(encoding="utf-8"))):
+    for text in _strings(parse(read(file))):
         name = Path(text)
         if text and len(text) < 255 and (file.parent / name).is_file() and not text.startswith("/dev/"):
             folder = file.parent.resolve()
@@ -141,11 +143,11 @@ def drop_in(
     """
     from otolith.machine_file import address_of, host_of
 
-    lines = [f"# Made by 'otolith install' from /etc/otolith/{name}.toml.", "[Service]"]
+    lines = [comment(f"Made by 'otolith install' from /etc/otolith/{name}.toml."), "[Service]"]
     devices = [text.partition("@")[0] for text in _strings(drivers) if text.startswith("/dev/")]
     if devices:
         lines += ["PrivateDevices=no", "DevicePolicy=closed"]
-        lines += [f"DeviceAllow={device} rw" for device in dict.fromkeys(devices)]
+        lines += [directive("DeviceAllow", device, "rw") for device in dict.fromkeys(devices)]
         lines += ["SupplementaryGroups=dialout"]
     hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
@@ -163,13 +165,14 @@ def drop_in(
     unknown = [host for host in hosts if local[host] is None]
     unknown += [host for host in published if networks is None and not local[host]]
     if unknown or foreign:
-        names = ", ".join(dict.fromkeys([*unknown, *foreign]))
-        lines += [f"# No IPAddressDeny: the addresses that {names} stands for are not known."]
+        names = some_names([shown(name) for name in dict.fromkeys([*unknown, *foreign])])
+        lines += [comment(f"No IPAddressDeny: the addresses of these are not known: {names}")]
         lines += ["# Its devices are hidden: 'Run Otolith as a service' shows how to allow them."] if foreign else []
         return "\n".join([*lines, ""])
     multicast = ["multicast"] if "udp_multicast" in buses else []
-    allowed = dict.fromkeys(["localhost", *multicast, *hosts, *(networks or ())])
-    return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
+    allowed = ["localhost", *multicast, *addresses([*hosts, *(networks or ())])]
+    lines += ["IPAddressDeny=any", *(directive("IPAddressAllow", host) for host in dict.fromkeys(allowed))]
+    return "\n".join([*lines, ""])
 
 
 def _can_bus(driver: Table) -> str:
