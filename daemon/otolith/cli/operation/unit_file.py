@@ -29,9 +29,7 @@ def directive(key: str, *words: str) -> str:
     """
     for word in words:
         if not WORD.fullmatch(word):
-            remedy = (
-                "give the device another name by udev, of letters, digits and _ . / : @ + , = ~ -"
-            )
+            remedy = "give the device another name by udev, of letters, digits and _ . / : @ + , = ~ -"
             raise ConfigurationError(f"{shown(word)} cannot be a word of {key}= in a unit of systemd: {remedy}")
     return f"{key}={' '.join(words)}"
 
