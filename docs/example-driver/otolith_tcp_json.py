@@ -71,7 +71,7 @@ class TcpJson(ThreadedDriver):
 
     def link(self) -> Link:
         """Return whether readings arrive, or why not."""
-        return Link(self._connection.up, self._connection.reason)
+        return Link(*self._connection.state)
 
     def describe(self) -> list[str]:
         """Return a line per fact, for ``otolith check``."""

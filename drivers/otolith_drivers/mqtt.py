@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import ssl
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -127,6 +128,7 @@ class Messages:
     def __init__(self, options: MqttOptions, signals: Sequence[Signal]) -> None:
         """Raise ConfigurationError for a unit of another quantity, or a time in messages that are plain numbers."""
         self._path, self._format = options.time, options.time_format
+        self._lock = threading.Lock()  # of what messages change
         self.received = self.lost = self.retained = 0
         self.topics: dict[str, TopicSignals] = {}
         for signal in signals:
@@ -148,6 +150,10 @@ class Messages:
         topic = self.topics.get(name)
         if topic is None:
             return []
+        with self._lock:
+            return self._take(topic, payload, now, retained=retained)
+
+    def _take(self, topic: TopicSignals, payload: bytes, now: float, *, retained: bool) -> list[Sample]:
         if retained:  # stored by the broker: its value was true at an unknown time
             topic.retained = True
             self.retained += 1
@@ -171,7 +177,13 @@ class Messages:
 
     def offsets(self) -> list[float]:
         """Return this computer's monotonic clock minus that of the sender, s, of each topic with times."""
-        return [topic.clock.offset for topic in self.topics.values() if math.isfinite(topic.clock.offset)]
+        with self._lock:
+            return [topic.clock.offset for topic in self.topics.values() if math.isfinite(topic.clock.offset)]
+
+    def warnings(self, now: float, begun: float) -> list[str]:
+        """Return what is wrong at ``now`` (s) since the subscription at ``begun`` (s), a line each."""
+        with self._lock:
+            return [line for topic in self.topics.values() for line in topic.warnings(now, begun)]
 
     def _time(self, topic: TopicSignals, content: Any, now: float) -> float:
         """Return the time of a message on this computer's monotonic clock, s; raise ValueError if it has none."""
@@ -284,7 +296,7 @@ class MqttListener(ThreadedDriver):
         return Sampling.CYCLIC if self._options.time is None else Sampling.POLLED
 
     def open(self, deliver: Deliver) -> None:
-        self._connection.reason = "not connected yet"
+        self._connection.stay_down("not connected yet")
         self._start("mqtt-listen", self._run, deliver)
 
     def counters(self) -> Counters:
@@ -292,8 +304,8 @@ class MqttListener(ThreadedDriver):
         return Counters(messages.received, messages.bad, messages.lost, self._connection.count)
 
     def link(self) -> Link:
-        now, messages, connection = time.monotonic(), self._messages, self._connection
-        lines = [line for topic in messages.topics.values() for line in topic.warnings(now, self._begun)]
+        now, messages, (up, reason) = time.monotonic(), self._messages, self._connection.state
+        lines = messages.warnings(now, self._begun)
         facts = []
         if messages.retained:
             facts.append(f"{counted(messages.retained, 'retained message')} not used")
@@ -301,7 +313,7 @@ class MqttListener(ThreadedDriver):
             wall = time.time() - now
             ends = [f"{-wall - offset:+.4g} s" for offset in {min(offsets), max(offsets)}]
             facts.append(f"the senders' clocks minus this computer's: {' to '.join(sorted(ends))}, less the way here")
-        return Link(connection.up, connection.reason, tuple(lines) if connection.up else (), ", ".join(facts))
+        return Link(up, reason, tuple(lines) if up else (), ", ".join(facts))
 
     def describe(self) -> list[str]:
         stamps = "times of arrival" if self._options.time is None else f"times of the field {self._options.time}"
@@ -368,7 +380,7 @@ class MqttListener(ThreadedDriver):
         host, port = self._options.address
         client.connect(host, port, keepalive=round(self._options.keepalive))
         begun, unanswered = time.monotonic(), "no answer of a broker: is one there, and is tls right?"
-        self._connection.reason = unanswered
+        self._connection.stay_down(unanswered)
         while not self._stop.is_set():
             code = client.loop(LOOP_TIMEOUT)
             if self._refusal:

@@ -39,7 +39,7 @@ def test_each_change_is_logged_once_and_each_return_counted(caplog: pytest.LogCa
         connection.come_up("answers")
         assert (connection.up, connection.reason) == (True, "")
         for _ in range(3):
-            connection.reason = "waiting"  # between two attempts
+            connection.stay_down("waiting")  # between two attempts
             connection.go_down("no answer")
         assert (connection.up, connection.reason) == (False, "no answer")
     assert connection.count == 1

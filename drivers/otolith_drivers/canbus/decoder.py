@@ -5,6 +5,7 @@ is intact and new, and reads its signals. No clock in here: the time of a frame 
 """
 
 import math
+import threading
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -151,7 +152,7 @@ class MessageReader:
             waited = now - begun
             limit = max(MIN_WAIT, WAIT_PERIODS * (self._declared_period or self._database_period))
             return [f"{self.title} has not come once in {waited:.1f} s"] if waited > limit else []
-        rejections = list(self._rejections.values()) if unused else []  # the receive thread may add one
+        rejections = self._rejections.values() if unused else ()
         lines = [line for rejection in rejections for line in rejection.warnings(now, self.title)]
         if self._counter is not None and self._counter.repeated >= MIN_STUCK_FRAMES:
             lines.append(self._stuck_counter(self._counter))
@@ -280,6 +281,7 @@ class FrameDecoder:
         }
         self._unreadable = 0
         self._begun: float | None = None
+        self._lock = threading.Lock()  # Of all that frames change
 
     def begin(self, time: float) -> None:
         """Listening begins at ``time`` (s); a message that does not come from then on is reported."""
@@ -290,6 +292,10 @@ class FrameDecoder:
 
         Never raises: a frame that cannot be used is counted.
         """
+        with self._lock:
+            return self._decode(frame, time)
+
+    def _decode(self, frame: can.Message, time: float) -> list[Sample]:
         try:
             if frame.is_error_frame or frame.is_remote_frame:
                 if frame.is_error_frame:
@@ -314,12 +320,14 @@ class FrameDecoder:
     def counters(self) -> Counters:
         """What has been received so far; ``reconnects`` stays 0."""
         readers, assembler = self._readers.values(), self._groups and self._groups.assembler
-        return Counters(
-            received=sum(reader.received for reader in readers),
-            bad=sum(reader.bad for reader in readers) + self._unreadable + (assembler.broken.count if assembler else 0),
-            # The period or the counter of a message shows overflows as well, unless it has neither.
-            lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
-        )
+        with self._lock:
+            broken = assembler.broken.count if assembler else 0
+            return Counters(
+                received=sum(reader.received for reader in readers),
+                bad=sum(reader.bad for reader in readers) + self._unreadable + broken,
+                # The period or the counter of a message shows overflows as well, unless it has neither.
+                lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
+            )
 
     def warnings(self, now: float, *, unused: bool = True) -> list[str]:
         """What is wrong at ``now`` (s, of the clock of :meth:`decode`), a line each.
@@ -328,11 +336,12 @@ class FrameDecoder:
         """
         if self._begun is None:
             self._begun = now
-        lines = self.faults.warnings(now) + (self._groups.warnings(now) if self._groups is not None else [])
-        for reader in self._readers.values():
-            lines += reader.warnings(now, self._begun, unused=unused)
-        for node in self._nodes:
-            lines += node.warnings(now)
+        with self._lock:
+            lines = self.faults.warnings(now) + (self._groups.warnings(now) if self._groups is not None else [])
+            for reader in self._readers.values():
+                lines += reader.warnings(now, self._begun, unused=unused)
+            for node in self._nodes:
+                lines += node.warnings(now)
         return lines
 
     @property
@@ -342,8 +351,9 @@ class FrameDecoder:
 
     def slowest_period(self) -> float | None:
         """The longest period (s) of the regular messages; None if there are none yet."""
-        estimates = [reader.periods for reader in self._readers.values()]
-        return max((one.period for one in estimates if one.regular and one.period is not None), default=None)
+        with self._lock:
+            estimates = [reader.periods for reader in self._readers.values()]
+            return max((one.period for one in estimates if one.regular and one.period is not None), default=None)
 
     def identifiers(self) -> list[tuple[int, bool]]:
         """The arbitration IDs that are decoded, and whether each is an extended one."""

@@ -85,8 +85,9 @@ class CanReceiver(ThreadedDriver):
         )
 
     def link(self) -> Link:
-        if not self._connection.up:
-            return Link(up=False, reason=self._connection.reason)
+        up, reason = self._connection.state
+        if not up:
+            return Link(up=False, reason=reason)
         if self._decoder.faults.bus_off:
             return Link(up=False, reason="bus off: the controller has left the bus after too many errors")
         now = time.monotonic()
@@ -204,7 +205,7 @@ class CanReceiver(ThreadedDriver):
                     return bus
                 _shut(bus)
                 failure = f"CAN bus {self._options.title()}: {cause}"
-            self._connection.reason = failure
+            self._connection.stay_down(failure)
         return None
 
 

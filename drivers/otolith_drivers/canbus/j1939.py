@@ -236,6 +236,6 @@ class ParameterGroups:
         return lines + [
             f"{group.title} (PGN {number}) comes from the addresses 0x{group.source:02X}, which is used, and "
             f"{', '.join(f'0x{other:02X}' for other in sorted(group.others))}: set source_address in [driver]"
-            for number, group in list(self._groups.items())
+            for number, group in self._groups.items()
             if group.others and group.source is not None and group.declared is None
         ]

@@ -208,9 +208,10 @@ class PeriodEstimator:
 
     def describe(self) -> str:
         """The period, as a clause."""
-        if self.period is None:
+        period = self.period  # another thread may set it to None
+        if period is None:
             return "its period is not known"
-        return f"it came every {period_text(self.period)}" + ("" if self.regular else " or so, not regularly")
+        return f"it came every {period_text(period)}" + ("" if self.regular else " or so, not regularly")
 
     def _take_burst(self, frames: int) -> None:
         """Take ``frames`` that came early: what was unconfirmed was held up, and not lost."""

@@ -38,16 +38,30 @@ class Reconnection:
 
     def __init__(self, title: str, log: logging.Logger) -> None:
         """``title`` begins each line of the log."""
-        self.up, self.reason, self.count = False, "not opened yet", 0
+        self.state, self.count = (False, "not opened yet"), 0  # Up or not, and why not: both change at once
         self.backoff = ReconnectBackoff()
         self._title, self._log = title, log
         self._was_up, self._begun = False, 0.0
         self._logged = ""  # the latest reason
 
+    @property
+    def up(self) -> bool:
+        """Whether the other end answers."""
+        return self.state[0]
+
+    @property
+    def reason(self) -> str:
+        """Why it is down; empty if it is up."""
+        return self.state[1]
+
+    def stay_down(self, reason: str) -> None:
+        """Note why the connection is down, without a line in the log."""
+        self.state = False, reason
+
     def come_up(self, what: str) -> None:
         """Note that the other end ``what``, like "answers"."""
         if not self.up:
-            self.up, self.reason, self._logged = True, "", ""
+            self.state, self._logged = (True, ""), ""
             self.count += self._was_up
             self._was_up = True
             self._begun = time.monotonic()
@@ -60,7 +74,7 @@ class Reconnection:
             self._log.warning("%s: %s; retried until it answers", self._title, reason)
         if self.up and time.monotonic() - self._begun >= LASTING:
             self.backoff.reset()
-        self.up, self.reason = False, reason
+        self.state = False, reason
 
 
 @dataclass(slots=True)

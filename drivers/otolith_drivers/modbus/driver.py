@@ -64,7 +64,7 @@ class ModbusPoller(ThreadedDriver):
         self._connection = Reconnection(options.title(), log)
 
     def open(self, deliver: Deliver) -> None:
-        self._connection.reason = "not connected yet"
+        self._connection.stay_down("not connected yet")
         self._start("modbus-poll", self._run, deliver)
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ class ModbusPoller(ThreadedDriver):
         return Counters(self._received, self._bad, self._lost, self._connection.count)
 
     def link(self) -> Link:
-        schedule, requests = self._schedule, self._requests.requests
+        schedule, requests, (up, reason) = self._schedule, self._requests.requests, self._connection.state
         warnings = [*self._requests.warnings(time.monotonic()), *self._order.warnings()]
         warnings += self._staleness.warnings(requests, schedule.period)
         period = schedule.period if schedule.known or schedule.period > schedule.requested else None
@@ -85,7 +85,7 @@ class ModbusPoller(ThreadedDriver):
             plan_text += f", times right within {500.0 * max(trips):.2g} ms"
         if self._closings >= MAX_FAILURES:
             plan_text += ", reconnected for each request, as the device closes the connection after each answer"
-        return Link(self._connection.up, self._connection.reason, tuple(warnings), plan_text, period)
+        return Link(up, reason, tuple(warnings), plan_text, period)
 
     def describe(self) -> list[str]:
         requests, period = self._requests.requests, self._schedule.requested
@@ -165,7 +165,7 @@ class ModbusPoller(ThreadedDriver):
         """Return the request if the device is busy and can be asked again before the next round; else note it."""
         log.debug("%s: %s", request.describe(), error)
         if not self._connection.up:
-            self._connection.reason = f"requests are refused: {error}"
+            self._connection.stay_down(f"requests are refused: {error}")
         now, schedule = time.monotonic(), self._schedule
         if error.code in BUSY_CODES and now + 2.0 * schedule.period / BUSY_PAUSES < schedule.due:
             return [request]

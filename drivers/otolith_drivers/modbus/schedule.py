@@ -307,13 +307,15 @@ class PollSchedule:
     @property
     def achieved(self) -> float | None:
         """Mean time from round to round in s; None while too few rounds have followed each other."""
-        if len(self._starts) < DECISION_ROUNDS // 2:
+        starts = tuple(self._starts)  # another thread may clear it
+        if len(starts) < DECISION_ROUNDS // 2:
             return None
-        return (self._starts[-1] - self._starts[0]) / (len(self._starts) - 1)
+        return (starts[-1] - starts[0]) / (len(starts) - 1)
 
     def describe(self) -> str:
         """Return the requested and achieved rate in words."""
-        achieved = "achieved: not known yet" if self.achieved is None else f"{1 / self.achieved:.1f} achieved"
+        period = self.achieved
+        achieved = "achieved: not known yet" if period is None else f"{1 / period:.1f} achieved"
         coarser = f" (the grid is now {self.period * 1e3:g} ms)" if self.is_slow else ""
         return f"{1 / self.requested:g} Hz asked, {achieved}{coarser}"
 

@@ -69,8 +69,8 @@ class NodeSignal:
 
     def warnings(self, now: float) -> list[str]:
         """Return what is wrong at ``now`` (s), a line each."""
-        name = self.signal.name
-        return [f"{name}: {self.fault}"] if self.fault else self.unusable.warnings(now, name)
+        name, fault = self.signal.name, self.fault  # the event loop may change it
+        return [f"{name}: {fault}"] if fault else self.unusable.warnings(now, name)
 
 
 class Readings:
@@ -203,14 +203,13 @@ class OpcuaSubscriber(ThreadedDriver):
         self._slow = ""  # what the server grants less than was asked
         self._ended = ""  # why the subscription has ended
         self._certificate_warnings: list[str] = []
-        self._ahead = math.nan  # s; the server's clock minus this computer's
         self._interval = options.interval  # s between two messages
         self._clocks_due = 0.0  # s; when they are compared again
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
 
     def open(self, deliver: Deliver) -> None:
-        self._connection.reason = "not connected yet"
+        self._connection.stay_down("not connected yet")
         self._start("opcua-subscribe", lambda: asyncio.run(self._run(deliver)))
 
     def close(self) -> None:
@@ -224,20 +223,19 @@ class OpcuaSubscriber(ThreadedDriver):
         return Counters(readings.received, readings.bad, readings.lost, self._connection.count)
 
     def link(self) -> Link:
-        readings, connection, now = self._readings, self._connection, time.monotonic()
+        readings, now, (up, reason) = self._readings, time.monotonic(), self._connection.state
         lines = self._certificate_warnings + [line for node in readings.signals for line in node.warnings(now)]
         if readings.server_stamped:
             lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
         plan = ""
         if readings.clock.known:
-            where = "ahead of" if self._ahead > 0.0 else "behind"
+            ahead = now - time.time() - readings.clock.offset
+            where = "ahead of" if ahead > 0.0 else "behind"
             bound = f"{1e3 * readings.clock.error:.2g} ms"
-            plan = f"the server's clock is {abs(self._ahead):.4g} s {where} this computer's, known within {bound}"
+            plan = f"the server's clock is {abs(ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
             plan += f", {self._slow}" if self._slow else ""
-        return Link(
-            connection.up, connection.reason, tuple(lines) if connection.up else (), plan, latency=self._interval
-        )
+        return Link(up, reason, tuple(lines) if up else (), plan, latency=self._interval)
 
     def describe(self) -> list[str]:
         nodes = [
@@ -286,7 +284,6 @@ class OpcuaSubscriber(ThreadedDriver):
 
     async def _compare_clocks(self, client: Client) -> None:
         await exchange(client, self._readings.clock)
-        self._ahead = time.monotonic() - time.time() - self._readings.clock.offset
         self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
 
     async def _look_up(self, client: Client) -> None:

@@ -131,12 +131,12 @@ class ReplayDriver(ThreadedDriver):
         return Counters(received=self._received, bad=self._bad, lost=lost)
 
     def link(self) -> Link:
-        reader = self._reader
+        reader, reason = self._reader, self._down_reason  # the thread may change them
         warnings = [] if reader is None else reader.warnings()
         silence = self._clock - time.monotonic()
-        if self._paced and not self._down_reason and silence > SILENCE_WARNING:
+        if self._paced and not reason and silence > SILENCE_WARNING:
             warnings.append(f"the next row of the file comes in {silence:.0f} s")
-        return Link(up=not self._down_reason, reason=self._down_reason, warnings=tuple(warnings))
+        return Link(up=not reason, reason=reason, warnings=tuple(warnings))
 
     def describe(self) -> list[str]:
         return self._description
