@@ -80,7 +80,7 @@ def test_a_command_that_reads_nothing_and_one_that_succeeds_after_a_failure(
     wait_for(lambda: command.failed == 1)
     (tmp_path / "well").touch()
     command.run(EVENT)
-    wait_for(lambda: not command.is_failing)
+    wait_for(lambda: not command.outage)
     (tmp_path / "well").unlink()
     command.run(EVENT)
     wait_for(lambda: len(caplog.records) == 2)  # it is logged after it is counted

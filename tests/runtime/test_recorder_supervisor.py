@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from otolith.machine import LoadedMachine, load_machine
-from otolith.runtime.process import RECORDER_TIMEOUT, RecorderSupervisor
+from otolith.runtime.process import MIN_DEATHS, RECORDER_TIMEOUT, RecorderSupervisor
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.replay.recording import RecordingReader
 from tests.conftest import EXAMPLES
@@ -68,6 +68,22 @@ def test_a_stopped_recorder_is_killed_and_counted(
     _, second = sorted((tmp_path / "recordings").iterdir(), key=lambda path: path.stat().st_mtime_ns)
     with RecordingReader(second, UNITS) as reader:
         assert sum(len(part.times) for part in reader.chunks()) == 200
+
+
+def test_a_recorder_that_always_dies_has_an_outage(supervisor: RecorderSupervisor) -> None:
+    supervisor.start(0.0)
+    supervisor.offer(next(noise(1)), 1.0)
+    outages = list[str]()
+    for index in range(MIN_DEATHS + 1):
+        outages.append(supervisor.outage)
+        if supervisor._process.alive:
+            supervisor._process._process.kill()
+            supervisor._process._process.join()
+        supervisor.poll(now := 100.0 * index + 10.0)
+        outages.append(supervisor.outage)
+        supervisor.poll(now + 50.0)
+    assert [bool(outage) for outage in outages].index(True) >= 2 * MIN_DEATHS - 3
+    assert "ended" in outages[-1]
 
 
 def test_a_recorder_without_work_does_not_hang(supervisor: RecorderSupervisor) -> None:

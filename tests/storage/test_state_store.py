@@ -23,7 +23,8 @@ from otolith.discovery.decision import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store
-from otolith.storage.state_store import StateStore, StateWriter
+from otolith.storage.disk import MIN_FAILURES
+from otolith.storage.state_store import LockedError, StateStore, StateWriter
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import writable
 from tests.cli.replays import MACHINE
@@ -166,6 +167,62 @@ def test_no_error_ends_the_thread_and_decisions_are_read_after_it(
         wait_for(lambda: writer.new_decisions() is not None)
     writer.stop(PATIENCE)
     assert store.components() == SAVED
+
+
+def test_a_state_directory_that_can_be_used_later_is_used_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("otolith.storage.disk.WRITE_RETRY", 0.0)
+    folder = tmp_path / "components"
+    StateStore("here", "motor", PROBLEM.base_model, folder).save(with_friction(-0.001))
+    folder.rename(tmp_path / "away")
+    folder.write_text("as a disk that is not there yet")
+    store = StateStore("here", "motor", PROBLEM.base_model, folder)
+    with pytest.raises(ServiceError) as raised:
+        store.lock_or_later()
+    writer = StateWriter(store, 0.0)
+    writer.fail(raised.value)
+    assert writer.outage == ""
+    writer.start()
+    writer.save(with_friction(-0.002))
+    wait_for(lambda: str(folder) in writer.outage)
+    folder.unlink()
+    (tmp_path / "away").rename(folder)
+    wait_for(lambda: not writer.outage and not writer._unsaved and not writer._to_save)
+    with pytest.raises(LockedError):
+        StateStore("here", "motor", PROBLEM.base_model, folder).lock()
+    writer.stop(PATIENCE)
+    (kept,) = folder.glob("*.kept.json")
+    assert kept.name in caplog.text
+    assert "-0.002" in store.components_path.read_text()
+    assert "-0.001" in kept.read_text()
+    store.unlock()
+
+
+def test_another_process_that_came_first_ends_who_waited_for_the_directory(tmp_path: Path) -> None:
+    folder = tmp_path / "components"
+    folder.write_text("")
+    store = StateStore("here", "motor", PROBLEM.base_model, folder)
+    with pytest.raises(ServiceError):
+        store.lock_or_later()
+    folder.unlink()
+    other = StateStore("here", "motor", PROBLEM.base_model, folder)
+    other.lock()
+    writer = StateWriter(store, 0.0)
+    writer.save(with_friction(-0.002))
+    writer.write()
+    assert writer.locked_out is not None
+    assert not other.components_path.exists()
+    other.unlock()
+
+
+def test_an_output_that_fails_again_and_again_has_an_outage(store: StateStore) -> None:
+    writer = StateWriter(store, 0.0)
+    for _ in range(MIN_FAILURES - 1):
+        writer.fail(ServiceError("the disk is busy"))
+        assert writer.outage == ""
+    writer.fail(ServiceError("the disk is full"))
+    assert "the disk is full" in writer.outage
 
 
 def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:

@@ -149,6 +149,8 @@ class Window:
     """Mean over the window of each signal that only the judgement of the estimates needs, as a temperature."""
     absent: Mapping[str, str] = field(default_factory=dict)
     """Of several sources, those that are down or gave no sample: in words, by name."""
+    outages: Mapping[str, str] = field(default_factory=dict)
+    """Outputs of the daemon that do not work, and why, by name."""
 
     @classmethod
     def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:

@@ -15,6 +15,7 @@ from otolith.health.diagnosis import MonitoringPlan, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity
 from otolith.health.observations import (
     BUS,
+    OUTPUT,
     PERSISTENT_WINDOWS,
     RELEASE_WINDOWS,
     SENSORS,
@@ -40,7 +41,7 @@ from otolith.health.schema import (
 )
 
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
-OF_DATA = ("data", "source/", "temperature/")  # Begins of the keys of conditions that nothing was learned for
+OF_DATA = ("data", "source/", "temperature/", OUTPUT)  # Begins of the keys of conditions that nothing was learned for
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
 
 

@@ -29,6 +29,7 @@ LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
+DAEMON, OUTPUT = "daemon", "output/"  # part to which an output belongs that does not work, and begin of its key
 PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}  # Of findings about no part
 NOTHING = FindingFeatures(FindingKind.OPEN)
 
@@ -79,6 +80,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     reasons = "; ".join(report.window.quality.reasons) or next(held, "")  # where values, not times, are unusable
     no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons)
     observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
+    observations += _of_outputs(report, before)
     if report.decision is WindowDecision.REFUSED:
         features = FindingFeatures(FindingKind.UNEXPLAINED, report.twin)
         text = plan.texts.translated(report.decision)
@@ -105,6 +107,14 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
     for key in sorted(absent.keys() | {key for key in before if key.startswith("source/")}):
         features = FindingFeatures(FindingKind.NO_SOURCE, subject=key.partition("/")[2])
         yield Observation(key, BUS, level if key in absent else Level.OK, features, absent.get(key, ""))
+
+
+def _of_outputs(report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
+    """Yield the outputs that do not work, and those that did not; the machine itself may be well."""
+    outages = {f"{OUTPUT}{name}": f"{name}: {reason}" for name, reason in (report.window.outages or {}).items()}
+    for key in sorted(outages.keys() | {key for key in before if key.startswith(OUTPUT)}):
+        features = FindingFeatures(FindingKind.NO_OUTPUT, subject=key.removeprefix(OUTPUT))
+        yield Observation(key, DAEMON, Level.WATCH if key in outages else Level.OK, features, outages.get(key, ""))
 
 
 def _of_returns(

@@ -39,6 +39,7 @@ class FindingKind(StrEnum):
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
     NO_SOURCE = "no source"  # One of several sources is down or gave no sample, or a source has a defect
+    NO_OUTPUT = "no output"  # The daemon cannot publish, record or save something
 
 
 class ComponentStatus(StrEnum):
@@ -206,6 +207,7 @@ class WindowDocument(DocumentModel):
     quality: QualityDocument
     observed: dict[str, float] | None = None  # Mean of each observed signal, as a temperature in K
     absent: dict[str, str] | None = None  # Of several sources, those that are down or gave no sample: in words, by name
+    outages: dict[str, str] | None = None  # Outputs of the daemon that do not work, and why, by name
 
 
 class CrossingDocument(DocumentModel):
@@ -379,6 +381,7 @@ def window_document(window: Window) -> WindowDocument:
         records=window.records,
         observed=dict(window.observed) or None,
         absent=dict(window.absent) or None,
+        outages=dict(window.outages) or None,
         quality=QualityDocument(
             verdict=quality.verdict,
             missing=quality.missing,

@@ -45,6 +45,7 @@ COMMAND_TIMEOUT = 30.0  # s until a command is killed with all processes of its 
 RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 RECORDER_TIMEOUT = 60.0  # s without an answer, while windows wait, after which the recorder hangs
+MIN_DEATHS = 4  # of the recorder in a row, from which it is out of order and not restarted by chance
 FORBIDDEN = {"0", "false", "off"}  # values of RERUN that switch its logging off
 MIN_FILES = 8  # files that the budget has room for at least
 PRIVATE_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")  # With them a command could notify systemd
@@ -121,6 +122,11 @@ class ChildProcess:
     def alive(self) -> bool:
         """Whether the process runs."""
         return self._process is not None and self._process.is_alive()
+
+    @property
+    def deaths(self) -> int:
+        """How often in a row the process has ended, or could not be started, before it did its work."""
+        return self._deaths
 
     @property
     def age(self) -> float:
@@ -206,7 +212,7 @@ class EventCommand:
         self._texts: queue.Queue[str] = queue.Queue(MAX_WAITING_EVENTS)
         self._lock = threading.Lock()
         self._running: set[subprocess.Popen[bytes]] = set()
-        self.is_failing = False  # Whether the last command failed
+        self.outage = ""  # Why the last command failed; empty if it succeeded
         self._is_stopped = False
         self._threads: list[threading.Thread] = []
 
@@ -243,7 +249,7 @@ class EventCommand:
             if failure:
                 self._fail(failure)
             else:
-                self.is_failing = False
+                self.outage = ""
 
     def _perform(self, text: str) -> str:
         """Run the command once; return why it failed, or an empty text."""
@@ -275,9 +281,9 @@ class EventCommand:
     def _fail(self, reason: str) -> None:
         with self._lock:
             self.failed += 1
-            is_first, self.is_failing = not self.is_failing, True
+            is_first, self.outage = not self.outage, f"{self._command[0]}: {reason}"
         if is_first:
-            log.warning("on_event: %s: %s; further failures are only counted", self._command[0], reason)
+            log.warning("on_event: %s; further failures are only counted", self.outage)
 
 
 def _kill_session(process: "subprocess.Popen[bytes]") -> None:
@@ -306,6 +312,14 @@ class RecorderSupervisor:
     def is_enabled(self) -> bool:
         """Whether the machine file wants recordings, and Rerun's variable of the environment does not forbid them."""
         return self._machine.file.recording.enabled and os.environ.get("RERUN", "").lower() not in FORBIDDEN
+
+    @property
+    def outage(self) -> str:
+        """Why nothing is recorded; empty if something is, or should not be."""
+        if not self.is_enabled or self._process.alive or self._first is not None:
+            return ""
+        ended = f"the recorder has ended {self._process.deaths} times" if self._process.deaths >= MIN_DEATHS else ""
+        return self._problem or ended
 
     @property
     def restarts(self) -> int:

@@ -39,9 +39,9 @@ from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
-from otolith.storage.state_store import StateWriter, store_of
+from otolith.storage.state_store import LockedError, StateWriter, store_of
 from otolith_drivers.base import Sampling
-from otolith_drivers.errors import OtolithError
+from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
 
@@ -207,7 +207,12 @@ class Service:
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
-        self._store.lock()
+        try:
+            self._store.lock_or_later()
+        except LockedError:
+            raise
+        except ServiceError as error:  # what is learned may be lost, but the machine is monitored
+            self._writer.fail(error)
         self._supervisor.state = self._restored(self._supervisor.state)
         self._start_history()
         self._windower.records = self._supervisor.records
@@ -317,7 +322,19 @@ class Service:
             self._supervisor.revise(lambda state: apply_decisions(state, decisions))
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
-        self._supervisor.submit(replace(window, absent=absent_sources(link, window, self._outputs)), now)
+        absent = absent_sources(link, window, self._outputs)
+        self._supervisor.submit(replace(window, absent=absent, outages=self._outages()), now)
+
+    def _outages(self) -> dict[str, str]:
+        """Return the outputs that do not work, and why: none of them keeps the machine from being monitored."""
+        outages = {
+            "state": self._writer.outage,
+            "history": "" if self._history is None else self._history.outage,
+            "evidence": self._evidence.outage,
+            "recording": self._recorder.outage,
+            "on_event": self._command.outage,
+        }
+        return {name: reason for name, reason in outages.items() if reason}
 
     def _adopt_achieved_period(self, period: float | None) -> None:
         """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""

@@ -80,6 +80,7 @@ class StateStore:
         self.decisions_path = folder / f"{site}.{machine}.decisions.json"
         self.lock_path = folder / f"{site}.{machine}.lock"
         self._lock: int | None = None
+        self._is_late = False  # Whether the lock could not be taken at the start
         self._is_blocked = False
 
     def lock(self) -> None:
@@ -110,6 +111,25 @@ class StateStore:
             os.pwrite(handle, str(os.getpid()).ljust(PROCESS_ID_BYTES).encode(), 0)
         self.unlock()
         self._lock = handle
+
+    def lock_or_later(self) -> None:
+        """Take the lock, or let :meth:`lock_late` take it; raises as :meth:`lock`."""
+        self._is_late = True
+        self.lock()
+        self._is_late = False
+
+    def lock_late(self) -> None:
+        """Take the lock that could not be taken at the start; raises as :meth:`lock`.
+
+        What was saved may be what could not be read then, so it is kept under another name.
+        """
+        if self._is_late:
+            self.lock()
+            self._is_late = False
+            if self.components_path.exists():
+                log.warning(
+                    "%s: could not be used at the start: kept as %s", self.components_path, self.set_aside().name
+                )
 
     def keep_lock(self) -> None:
         """Take the lock again if this process had it; raises as :meth:`lock`."""
@@ -322,7 +342,12 @@ class StateWriter(WriterThread):
         return self._new_decisions.popleft() if self._new_decisions else None
 
     def write(self) -> None:
-        """Save the latest state."""
+        """Save the latest state; take the lock first if it could not be taken at the start."""
+        try:
+            self._store.lock_late()
+        except LockedError as error:
+            self.locked_out = error
+            return
         if self._to_save:
             self._unsaved = self._to_save.popleft()
         if self._unsaved is not None:
