@@ -11,7 +11,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 
 def certificate(folder: Path, name: str, *, until: timedelta = timedelta(days=1)) -> tuple[Path, Path]:
-    """Write a certificate (DER) of 127.0.0.1 and of ``urn:NAME``, and its key (PEM); return their paths.
+    """Write a certificate (DER) of 127.0.0.1 and of ``urn:NAME``, and its private key (PEM); return their paths.
 
     It is valid ``until`` so long from now.
     """
@@ -33,6 +33,7 @@ def certificate(folder: Path, name: str, *, until: timedelta = timedelta(days=1)
     )
     paths = folder / f"{name}.der", folder / f"{name}.pem"
     paths[0].write_bytes(made.public_bytes(serialization.Encoding.DER))
+    paths[1].touch(mode=0o600)
     paths[1].write_bytes(
         key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     )

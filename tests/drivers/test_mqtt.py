@@ -131,6 +131,7 @@ def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: 
                 connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
             wait_for(lambda: "is one there" in driver.link().reason)
         assert not driver.link().up
+    (tmp_path / "none").touch(mode=0o600)
     (tmp_path / "none").write_text("nothing")
     certificate(tmp_path, "own")
     for keys, fault in (

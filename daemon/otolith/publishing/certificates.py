@@ -1,7 +1,6 @@
 """Certificates: the checks of those that a session uses, and the small certificate authority of ``otolith keys``."""
 
 import os
-import stat
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -15,11 +14,11 @@ from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from otolith.machine_file import address_of
+from otolith_drivers.common.credentials import SECRET_LIMIT, secret
 from otolith_drivers.config_files import content
 from otolith_drivers.errors import ConfigurationError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-MAX_PEM_BYTES = 1 << 16  # of a file with certificates, a key or passwords
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' makes
 CLOCK_TOLERANCE = timedelta(hours=1)  # by which a new certificate is valid before it was made
 
@@ -35,18 +34,10 @@ class Identity:
     key: Path
 
 
-def secret(path: Path, key: Key) -> bytes:
-    """Return the content of a file; raise ConfigurationError if it is unreadable, or open to every user."""
-    data = content(path, MAX_PEM_BYTES, key)
-    if path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
-        raise ConfigurationError(f"{path}: open to every user of this computer; 'chmod o-rwx {path}' closes it", key)
-    return data
-
-
 def authorities(path: Path, key: Key) -> list[x509.Certificate]:
     """Return the certificates of ``path``; raise ConfigurationError if it has none."""
     try:
-        return x509.load_pem_x509_certificates(content(path, MAX_PEM_BYTES, key))
+        return x509.load_pem_x509_certificates(content(path, SECRET_LIMIT, key))
     except ValueError as error:
         raise ConfigurationError(f"{path}: not a certificate in PEM form", key) from error
 

@@ -114,7 +114,7 @@ class Access:
                 remedy = "set passwords, or [zenoh.tls] with clients = true"
                 raise ConfigurationError(f"nothing proves a reader's name: {remedy}", ("zenoh", "access", "readers"))
             return {}
-        from otolith.publishing.certificates import secret  # noqa: PLC0415 - slow to import
+        from otolith_drivers.common.credentials import secret  # noqa: PLC0415 - slow to import
 
         key, path = ("zenoh", "access", "passwords"), self.path.parent.absolute() / access.passwords
         for number, line in enumerate(secret(path, key).decode(errors="replace").splitlines(), start=1):
@@ -178,7 +178,7 @@ def reader_settings(credentials: Credentials, connect: Iterable[str]) -> Setting
     """Return the settings of a reader's session; raise ConfigurationError if a file cannot be used."""
     settings: Settings = {}
     if credentials.login is not None:
-        from otolith.publishing.certificates import secret  # noqa: PLC0415 - slow to import
+        from otolith_drivers.common.credentials import secret  # noqa: PLC0415 - slow to import
 
         lines = secret(credentials.login, ()).decode(errors="replace").splitlines()
         name, password = _login(lines[0] if len(lines) == 1 else "", str(credentials.login))

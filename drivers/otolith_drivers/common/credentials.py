@@ -1,5 +1,7 @@
-"""Certificates, private keys and passwords of a driver, read from the files that its table names."""
+"""Certificates, private keys and passwords, read from the files that a table names."""
 
+import shlex
+import stat
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,6 +32,20 @@ class CredentialOptions(StrictModel):
         return self
 
 
+def secret(path: Path, key: tuple[str, ...]) -> bytes:
+    """Return the content of a file with passwords or a private key, at ``key`` of the machine file.
+
+    Raises:
+        ConfigurationError: the file is unreadable, or every user of this computer may read or change it.
+    """
+    data = content(path, SECRET_LIMIT, key)
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & (stat.S_IROTH | stat.S_IWOTH):
+        remedy = f"'chmod o-rwx {shlex.quote(str(path))}' closes it"
+        raise ConfigurationError(f"{path}: open to every user of this computer (mode {mode:04o}); {remedy}", key)
+    return data
+
+
 def certificate(path: Path, key: str) -> x509.Certificate:
     """Return the first certificate of ``path``, at ``key`` of the table; raise ConfigurationError if there is none."""
     where = ("driver", key)
@@ -44,10 +60,11 @@ def certificate_and_key(certificate_path: Path, key_path: Path) -> tuple[x509.Ce
     """Return the certificate and the private key of this client, which the table names ``certificate`` and ``key``.
 
     Raises:
-        ConfigurationError: a file is missing, has other content, or they do not belong together.
+        ConfigurationError: a file is missing or has other content, the key is open to every user, or they do not
+            belong together.
     """
     where = ("driver", "key")
-    own, data = certificate(certificate_path, "certificate"), content(key_path, SECRET_LIMIT, where)
+    own, data = certificate(certificate_path, "certificate"), secret(key_path, where)
     load = serialization.load_pem_private_key if _is_pem(data) else serialization.load_der_private_key
     try:
         key = load(data, None)
@@ -61,10 +78,10 @@ def certificate_and_key(certificate_path: Path, key_path: Path) -> tuple[x509.Ce
 
 
 def password(path: Path | None) -> str:
-    """Return the first line of a password file, empty without one; raise ConfigurationError if it is unreadable."""
+    """Return the first line of a password file, empty without one; raise ConfigurationError as :func:`secret`."""
     if path is None:
         return ""
-    lines = content(path, SECRET_LIMIT, ("driver", "password_file")).decode(errors="replace").splitlines()
+    lines = secret(path, ("driver", "password_file")).decode(errors="replace").splitlines()
     return lines[0] if lines else ""
 
 

@@ -151,8 +151,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "trusted").mkdir()
     for name in ("client", "expired"):
         (folder / "trusted" / f"{name}.der").write_bytes((folder / f"{name}.der").read_bytes())
-    (folder / "password").write_text("secret\n")
-    (folder / "wrong").write_text("guess\n")
+    for name, text in (("password", "secret\n"), ("wrong", "guess\n")):
+        (folder / name).touch(mode=0o600)
+        (folder / name).write_text(text)
     return folder
 
 
