@@ -35,6 +35,10 @@ class ConfigurationError(OtolithError):
         self.key = key
 
 
+class NotValidNowError(ConfigurationError):
+    """A certificate is not valid yet or not any more: the clock, or a new file in its place, may change that."""
+
+
 class DeviceError(OtolithError):
     """A device, bus or interface is missing or refuses."""
 

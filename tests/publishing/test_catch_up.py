@@ -16,9 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from otolith.publishing.publisher import Publisher
 from otolith.publishing.subscriber import MessageOrder, Subscriber
 from otolith.publishing.zenoh_config import Connection
-from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, Publisher, Topic, session, time_range
+from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, Topic, session, time_range
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.conftest import free_port
@@ -46,7 +47,7 @@ import sys
 from pathlib import Path
 from otolith.machine_file import ZenohTable
 from otolith.publishing.zenoh_config import Access
-from otolith.publishing.zenoh_session import Publisher
+from otolith.publishing.publisher import Publisher
 from otolith.storage.history_writer import Bounds
 from otolith.storage.history_writer import HistoryWriter
 from tests.storage.histories import MACHINE, SITE, documents

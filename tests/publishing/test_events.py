@@ -14,8 +14,9 @@ from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells
 from otolith.machine import load_machine
+from otolith.publishing.publisher import Publisher
 from otolith.publishing.recorder import _log_lines
-from otolith.publishing.zenoh_session import EVENT, Publisher, session
+from otolith.publishing.zenoh_session import EVENT, session
 from otolith.runtime.service import SUMMARY_INTERVAL, Service
 from tests.conftest import EXAMPLES, free_port
 from tests.health.test_events import assessed, report

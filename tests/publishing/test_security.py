@@ -18,6 +18,7 @@ import zenoh
 
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import make_authority, make_certificate, utc_now
+from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import (
     MAX_HALF_OPEN,
     TLS,
@@ -26,7 +27,7 @@ from otolith.publishing.zenoh_config import (
     listening,
     reader_settings,
 )
-from otolith.publishing.zenoh_session import ALIVE, Publisher, session
+from otolith.publishing.zenoh_session import ALIVE, session
 from tests.conftest import free_port
 from tests.health.test_events import report
 from tests.publishing import attacker

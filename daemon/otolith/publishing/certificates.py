@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from otolith.machine_file import address_of
 from otolith_drivers.common.credentials import SECRET_LIMIT, secret
 from otolith_drivers.config_files import content
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, NotValidNowError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' makes
@@ -48,6 +48,7 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     ``keys`` name CA, certificate and private key for the error. ``hosts`` are the names or addresses where it listens.
 
     Raises:
+        NotValidNowError: the certificate is not valid yet, or not any more; everything else is right.
         ConfigurationError: a file cannot be used, or they do not belong together; the message has the cause.
     """
     _, at_certificate, at_key = keys
@@ -61,18 +62,18 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
         raise ConfigurationError(f"{name}: has no common name, by which access is granted", at_certificate)
     if len(chain) == 1 and not any(_issued(own, authority) for authority in trusted):
         raise ConfigurationError(f"{name}: was not issued by {identity.ca}", at_certificate)
-    if now < own.not_valid_before_utc:
-        start = f"{own.not_valid_before_utc:%Y-%m-%d}"
-        raise ConfigurationError(f"{name}: valid only from {start}; check the clock of this computer", at_certificate)
-    if now > own.not_valid_after_utc:
-        expired = f"expired on {own.not_valid_after_utc:%Y-%m-%d}"
-        raise ConfigurationError(f"{name}: {expired}; 'otolith keys add' makes another", at_certificate)
     names = _names(own)
     for host in hosts:
         if not _is_for(names, host):
             remedy = f"'otolith keys add DIR NAME --host {host}' makes one"
             valid = ", ".join(sorted(names)) or "no host"
             raise ConfigurationError(f"{name}: not for {host}, but for {valid}; {remedy}", at_certificate)
+    if now < own.not_valid_before_utc:
+        start = f"{own.not_valid_before_utc:%Y-%m-%d}"
+        raise NotValidNowError(f"{name}: valid only from {start}; check the clock of this computer", at_certificate)
+    if now > own.not_valid_after_utc:
+        expired = f"expired on {own.not_valid_after_utc:%Y-%m-%d}"
+        raise NotValidNowError(f"{name}: {expired}; 'otolith keys add' makes another", at_certificate)
     return own.not_valid_after_utc
 
 

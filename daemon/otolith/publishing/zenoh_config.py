@@ -9,13 +9,14 @@ from pathlib import Path
 
 from otolith.machine_file import LOCAL, ZenohTable, host_of
 from otolith_drivers.config_files import Context, read
-from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith_drivers.errors import ConfigurationError, NotValidNowError, ServiceError
 from otolith_drivers.user_dirs import runtime_directory, runtime_folders
 
 SOCKET = "unixsock-stream/"
 ENCRYPTED = ("tls/", "quic/")
 TLS = "transport/link/tls"
-SOCKET_UMASK = 0o117  # a socket is for its user and its group
+SOCKET_MODE = 0o660  # a socket is for its user and its group
+OTHERS_WRITE = 0o002  # the bit of a umask; who may not write a socket cannot connect to it
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
@@ -72,14 +73,19 @@ class Access:
     path: Path = Path()
 
     def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, Validity]:
-        """Return settings to publish below ``prefix``, and their validity; raise ConfigurationError for a bad file."""
+        """Return settings to publish below ``prefix``, and their validity.
+
+        Raises:
+            NotValidNowError: an endpoint needs a certificate that is not valid now.
+            ConfigurationError: a file is wrong.
+        """
         listen = tuple(listen)
         try:
             encryption, validity = self._encryption(listen)
             passwords = self._passwords()
         except ConfigurationError as error:
-            Context(read(self.path)).fail(error.key, str(error))
-            raise
+            place = Context(read(self.path)).file.place(error.key)
+            raise type(error)(f"{place}: {error}", error.key) from error
         return {**_limits(), **encryption, **passwords, "access_control": self._control(prefix)}, validity
 
     def _encryption(self, listen: tuple[str, ...]) -> tuple[Settings, Validity]:
@@ -96,7 +102,12 @@ class Access:
         identity = Identity(folder / table.ca, folder / table.certificate, folder / table.key)
         hosts = [host_of(endpoint) for endpoint in listen if endpoint.startswith(ENCRYPTED)]
         keys = [("zenoh", "tls", name) for name in ("ca", "certificate", "key")]
-        validity = Validity(identity.certificate, check_identity(identity, keys, hosts, utc_now()))
+        try:
+            validity = Validity(identity.certificate, check_identity(identity, keys, hosts, utc_now()))
+        except NotValidNowError:
+            if encrypted:
+                raise
+            return {}, Validity()
         own = {
             f"{side}_{kind}": str(path)
             for side in ("listen", "connect")

@@ -1,33 +1,31 @@
-"""Zenoh: the session's configuration, the daemon's publisher, and its answers to queries of the history."""
+"""Zenoh: the session's configuration, the keys of a machine, and answers to queries of the history."""
 
 import json
 import logging
 import math
 import os
 import re
-import threading
+import stat
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Literal
 
 import zenoh
 
-from otolith.health.schema import ReportDocument
-from otolith.health.text import announcements
 from otolith.publishing.zenoh_config import (
     ENCRYPTED,
     LEASE,
+    OTHERS_WRITE,
     SOCKET,
-    SOCKET_UMASK,
+    SOCKET_MODE,
     TLS_TIMEOUT,
-    Access,
     Settings,
     raise_descriptor_limit,
 )
 from otolith.storage.history_writer import HistoryWriter
-from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import ServiceError
 
 log = logging.getLogger(__name__)
@@ -162,18 +160,36 @@ def session(
         whole["connect/timeout_ms"] = CLIENT_TIMEOUT
     if any(endpoint.startswith(ENCRYPTED) for endpoint in listen):
         raise_descriptor_limit()
-    # The process has one umask. Zenoh's thread binds the sockets before open() returns, and nothing else runs yet.
-    umask = os.umask(SOCKET_UMASK) if any(endpoint.startswith(SOCKET) for endpoint in listen) else None
     try:
         config = zenoh.Config()
         for key, value in whole.items():
             config.insert_json5(key, json.dumps(value))
-        return zenoh.open(config)
+        opened = zenoh.open(config)
     except zenoh.ZError as error:
         raise ServiceError(f"Zenoh cannot open {', '.join([*listen, *connect])}: {_cause(str(error))}") from error
+    for endpoint in listen:
+        if endpoint.startswith(SOCKET):
+            _share(endpoint.removeprefix(SOCKET).partition("#")[0])
+    return opened
+
+
+def protect_files() -> None:
+    """Let no other user write what this process makes, whoever started it; to be called before there are threads.
+
+    The umask belongs to the process: to change it for a moment would change the files that other threads make.
+    """
+    before = os.umask(OTHERS_WRITE)
+    os.umask(before | OTHERS_WRITE)
+
+
+def _share(path: str) -> None:
+    """Give a socket, which until now only its user can write, to its group as well."""
+    handle = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        if stat.S_ISSOCK(os.fstat(handle).st_mode):
+            Path(f"/proc/self/fd/{handle}").chmod(SOCKET_MODE)
     finally:
-        if umask is not None:
-            os.umask(umask)
+        os.close(handle)
 
 
 def close_session(opened: zenoh.Session) -> None:
@@ -190,72 +206,3 @@ def _cause(message: str) -> str:
     if "in use" in message or "acquire lock" in message:
         return f"{cause}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
     return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447 or unixsock-stream//run/a.sock"
-
-
-class Publisher:
-    """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
-
-    def __init__(
-        self,
-        site: str,
-        machine: str,
-        listen: Iterable[str],
-        access: Access = Access(),  # noqa: B008 - immutable
-        archive: HistoryWriter | None = None,
-    ) -> None:
-        """Queries for earlier reports and events are answered from ``archive``."""
-        settings, self._validity = access.settings(prefix(site, machine), listen)
-        self._warned_on: date | None = None
-        self.warn_of_expiry(datetime.now(UTC))
-        self._archive = archive
-        self._session = session(listen, access.zenoh.connect, settings)
-        self._site, self._machine = site, machine
-        self._lock = threading.Lock()
-        self._latest: str | None = None
-        key = REPORT.under(site, machine)
-        self._reports = self._session.declare_publisher(
-            key, encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=zenoh.CongestionControl.DROP
-        )
-        self._queryables = [
-            self._session.declare_queryable(key, self._answer, complete=True),
-            self._session.declare_queryable(EVENT.under(site, machine), self._answer_events, complete=True),
-        ]
-        self._token = self._session.liveliness().declare_token(ALIVE.under(site, machine))
-
-    def publish(self, document: ReportDocument) -> None:
-        """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
-        text = document.to_json()
-        with self._lock:
-            self._latest = text
-        self._reports.put(text)
-        others: list[tuple[str, DocumentModel]] = [
-            (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
-        ]
-        others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
-        for key, item in others:
-            self._session.put(
-                key,
-                item.model_dump_json(exclude_none=True),
-                encoding=zenoh.Encoding.APPLICATION_JSON,
-                congestion_control=zenoh.CongestionControl.DROP,
-            )
-
-    def warn_of_expiry(self, now: datetime) -> None:
-        """Log once a day that the certificate expires soon or has expired."""
-        if now.date() != self._warned_on and (warning := self._validity.warning(now)):
-            self._warned_on = now.date()
-            log.warning("%s", warning)
-
-    def close(self) -> None:
-        """Close the session; subscribers see the liveliness token disappear."""
-        close_session(self._session)
-
-    def _answer(self, query: zenoh.Query) -> None:
-        with self._lock:
-            latest = self._latest
-        with query:
-            answer(query, REPORT.under(self._site, self._machine), "report", latest, self._archive)
-
-    def _answer_events(self, query: zenoh.Query) -> None:
-        with query:
-            answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)

@@ -32,8 +32,9 @@ from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.zenoh_config import Access, listening
-from otolith.publishing.zenoh_session import Publisher
+from otolith.publishing.publisher import Publisher
+from otolith.publishing.zenoh_config import Access
+from otolith.publishing.zenoh_session import protect_files
 from otolith.runtime.process import SIGNALS, EventCommand, RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
@@ -182,7 +183,8 @@ class Service:
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
-            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine.
+            ConfigurationError: a file for the encryption of reports is wrong.
+            ServiceError: another daemon runs for the machine, or a file that the caller named cannot be recorded.
         """
         for number in SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
@@ -207,6 +209,7 @@ class Service:
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
+        protect_files()
         try:
             self._store.lock_or_later()
         except LockedError:
@@ -217,9 +220,8 @@ class Service:
         self._start_history()
         self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
-        zenoh, listen = self._machine.file.zenoh, listening(self._listen, f"{identity.site}.{identity.name}")
-        access = Access(zenoh, self._machine.path)
-        self._publisher = Publisher(identity.site, identity.name, listen, access, self._history)
+        access = Access(self._machine.file.zenoh, self._machine.path)
+        self._publisher = Publisher(identity.site, identity.name, self._listen, access, self._history)
         driver.open(self._rings.deliver)
         self._writer.start()
         self._evidence.start()
@@ -228,7 +230,7 @@ class Service:
             self._recorder.start(time.monotonic())
         self._started_at = self._progress_at = time.monotonic()
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
-        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(listen))
+        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, self._publisher.endpoints)
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""
@@ -333,6 +335,7 @@ class Service:
             "evidence": self._evidence.outage,
             "recording": self._recorder.outage,
             "on_event": self._command.outage,
+            **({} if self._publisher is None else self._publisher.outages(datetime.now(UTC))),
         }
         return {name: reason for name, reason in outages.items() if reason}
 

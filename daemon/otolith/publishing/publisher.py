@@ -1,0 +1,208 @@
+"""Publishes the reports of one machine on all its endpoints; one that cannot be opened does not concern the others.
+
+All endpoints share one Zenoh session. If one of them cannot be opened, each gets a session of its own, and a thread
+tries the rest again.
+"""
+
+import logging
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
+
+import zenoh
+
+from otolith.health.schema import ReportDocument
+from otolith.health.text import announcements
+from otolith.publishing.zenoh_config import ENCRYPTED, Access, Validity, listening
+from otolith.publishing.zenoh_session import ALIVE, EVENT, PARAMETER, REPORT, answer, close_session, prefix, session
+from otolith.storage.history_writer import HistoryWriter
+from otolith_drivers.config_files import DocumentModel
+from otolith_drivers.errors import NotValidNowError, OtolithError, ServiceError
+
+log = logging.getLogger(__name__)
+
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+FIRST_RETRY, MAX_RETRY = 1.0, 30.0  # s from an endpoint that could not be opened to the next try; it doubles
+CLOSE_WAIT = 1.0  # s for a try that has begun
+UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; everything else is a mistake
+
+
+@dataclass(frozen=True, slots=True)
+class _Endpoints:
+    """Endpoints that share a session."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        return ", ".join((*self.listen, *self.connect))
+
+    @property
+    def single(self) -> "Iterator[_Endpoints]":
+        """Each endpoint to listen on alone, and those to connect to, which Zenoh itself tries again."""
+        yield from (_Endpoints((endpoint,)) for endpoint in self.listen)
+        if self.connect:
+            yield _Endpoints(connect=self.connect)
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """A session, and what is declared in it for as long as it is open."""
+
+    endpoints: _Endpoints
+    opened: zenoh.Session
+    reports: zenoh.Publisher
+    declared: tuple[object, ...] = field(default=())
+
+
+class Publisher:
+    """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
+
+    def __init__(
+        self,
+        site: str,
+        machine: str,
+        listen: Iterable[str],
+        access: Access = Access(),  # noqa: B008 - immutable
+        archive: HistoryWriter | None = None,
+    ) -> None:
+        """Queries for earlier reports and events are answered from ``archive``.
+
+        Raises:
+            ConfigurationError: the machine file, or a file that it names, is wrong.
+        """
+        self._site, self._machine, self._access, self._archive = site, machine, access, archive
+        self._lock, self._closing = threading.Lock(), threading.Event()
+        self._latest: str | None = None
+        self._validity, self._warned_on = Validity(), date.min
+        self._sessions: tuple[_Session, ...] = ()
+        self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
+        self._thread = threading.Thread(target=self._retry, name="open-endpoints", daemon=True)
+        everything = _Endpoints(tuple(listen), tuple(access.zenoh.connect))
+        try:
+            self._open(everything)
+        except UNAVAILABLE as error:
+            self._open_each(everything, error)
+        self.warn_of_expiry(datetime.now(UTC))
+        if self._waiting:
+            self._thread.start()
+
+    @property
+    def endpoints(self) -> str:
+        """The endpoints that are open, in words."""
+        with self._lock:
+            return ", ".join(each.endpoints.text for each in self._sessions) or "no endpoint yet"
+
+    def publish(self, document: ReportDocument) -> None:
+        """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
+        text = document.to_json()
+        with self._lock:
+            self._latest, sessions = text, self._sessions
+        others: list[tuple[str, DocumentModel]] = [
+            (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
+        ]
+        others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
+        texts = [(key, item.model_dump_json(exclude_none=True)) for key, item in others]
+        for each in sessions:
+            each.reports.put(text)
+            for key, own in texts:
+                each.opened.put(
+                    key,
+                    own,
+                    encoding=zenoh.Encoding.APPLICATION_JSON,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                )
+
+    def outages(self, now: datetime) -> dict[str, str]:
+        """Return the endpoints where nobody can connect, and why."""
+        with self._lock:
+            outages = {f"reports on {endpoints.text}": reason for endpoints, reason in self._waiting.items()}
+        if self._validity.end is not None and now > self._validity.end:
+            outages["reports to other computers"] = self._validity.warning(now)
+        return outages
+
+    def warn_of_expiry(self, now: datetime) -> None:
+        """Log once a day that the certificate expires soon or has expired."""
+        if now.date() != self._warned_on and (warning := self._validity.warning(now)):
+            self._warned_on = now.date()
+            log.warning("%s", warning)
+
+    def close(self) -> None:
+        """Close the sessions; subscribers see the liveliness token disappear."""
+        self._closing.set()
+        with suppress(RuntimeError):  # it was never started
+            self._thread.join(CLOSE_WAIT)
+        with self._lock:
+            sessions, self._sessions = self._sessions, ()
+        for each in sessions:
+            close_session(each.opened)
+
+    def _open_each(self, everything: _Endpoints, error: OtolithError) -> None:
+        """Open what can be opened after all endpoints together gave the ``error``."""
+        single = list(everything.single)
+        for endpoints in single:
+            if len(single) > 1:
+                try:
+                    self._open(endpoints)
+                    continue
+                except UNAVAILABLE as own:
+                    error = own
+            self._waiting[endpoints] = str(error)
+            log.warning("no reports on %s: %s; it is tried again", endpoints.text, error)
+
+    def _retry(self) -> None:
+        pause = FIRST_RETRY
+        while self._waiting and not self._closing.wait(pause):
+            pause = min(2.0 * pause, MAX_RETRY)
+            for endpoints, before in list(self._waiting.items()):
+                reason = ""
+                try:
+                    self._open(endpoints)
+                except Exception as error:  # noqa: BLE001 - OtolithError, OSError of a disk, or a bug: none ends it
+                    reason = str(error) or type(error).__name__
+                if not reason:
+                    log.info("reports on %s as well", endpoints.text)
+                elif reason != before:
+                    log.warning("no reports on %s: %s; it is tried again", endpoints.text, reason)
+                with self._lock:
+                    self._waiting = {**self._waiting, endpoints: reason}
+                    self._waiting = {each: text for each, text in self._waiting.items() if text}
+
+    def _open(self, endpoints: _Endpoints) -> None:
+        """Open a session; raise what is in ``UNAVAILABLE``, or ConfigurationError."""
+        site, machine = self._site, self._machine
+        listen = listening(endpoints.listen, f"{site}.{machine}")
+        zenoh_table = self._access.zenoh.model_copy(update={"connect": endpoints.connect})
+        settings, validity = replace(self._access, zenoh=zenoh_table).settings(prefix(site, machine), listen)
+        opened = session(listen, endpoints.connect, settings)
+        key = REPORT.under(site, machine)
+        reports = opened.declare_publisher(
+            key, encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=zenoh.CongestionControl.DROP
+        )
+        declared = (
+            opened.declare_queryable(key, self._answer, complete=True),
+            opened.declare_queryable(EVENT.under(site, machine), self._answer_events, complete=True),
+            opened.liveliness().declare_token(ALIVE.under(site, machine)),
+        )
+        with self._lock:
+            is_late = self._closing.is_set()
+            if not is_late:
+                self._sessions += (_Session(_Endpoints(listen, endpoints.connect), opened, reports, declared),)
+        if is_late:
+            close_session(opened)
+            return
+        if any(endpoint.startswith(ENCRYPTED) for endpoint in (*listen, *endpoints.connect)):
+            self._validity = validity
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with self._lock:
+            latest = self._latest
+        with query:
+            answer(query, REPORT.under(self._site, self._machine), "report", latest, self._archive)
+
+    def _answer_events(self, query: zenoh.Query) -> None:
+        with query:
+            answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)
