@@ -6,7 +6,6 @@ two leaves a low half that jumps over its whole range; a number in a wrong order
 not change carry no information about their type, and none is inferred.
 """
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -336,11 +335,6 @@ def _judged(part: Part, rivals: Sequence[tuple[float, Part]]) -> Part:
     verdict = LayoutVerdict.LIKELY if others or len(part.numbers) < MIN_READINGS else LayoutVerdict.CERTAIN
     probability = min(1.0 / (1.0 + sum(weights.values())), MAX_PROBABILITY)
     return replace(part, verdict=verdict, others=tuple(others.values())[:MAX_OTHERS], probability=probability)
-
-
-def quoted(value: str | float) -> str:
-    """Return a number or text as TOML writes it, which is as JSON does."""
-    return json.dumps(value, ensure_ascii=False)
 
 
 def number_text(value: float, layout: Layout, step: float = 0.0) -> str:

@@ -25,7 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.toml_lines import toml_key, toml_value
 from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
@@ -265,10 +266,9 @@ def public_text(tables: Mapping[str, Any]) -> str:
     for name, content in tables.items():
         for table in content if isinstance(content, list) else [content]:
             own = {"file": TWIN} if name == "twin" else table
-            lines.append(f"[[{name}]]" if isinstance(content, list) else f"[{name}]")
-            # TOML is JSON but for its colons, and has no pairs of escaped surrogates.
-            write = partial(json.dumps, default=str, ensure_ascii=False, separators=(", ", " = "))
-            lines += [f"{write(key)} = {write(own[key])}" for key in own if key in PUBLIC_KEYS.get(name, own)]
+            lines.append(f"[[{toml_key(name)}]]" if isinstance(content, list) else f"[{toml_key(name)}]")
+            keys = [key for key in own if key in PUBLIC_KEYS.get(name, own)]
+            lines += [f"{toml_key(key)} = {toml_value(own[key])}" for key in keys]
     return "\n".join([*lines, ""])
 
 

@@ -23,7 +23,8 @@ from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.options import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
-from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, quoted, spread
+from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, spread
+from otolith_drivers.toml_lines import toml_comment, toml_value
 
 MAX_IDENTIFIERS = 2048  # that are kept apart; a bus with standard identifiers has no more
 MAX_FRAMES = 500  # of each identifier that are kept
@@ -315,13 +316,13 @@ def can_driver_lines(options: BusOptions, picture: Picture, database: str | None
     for key in ("interface", "channel", "port"):
         value = getattr(options, key)
         if value != BusOptions.model_fields[key].default:
-            lines.append(f"{key} = {quoted(value)}")
+            lines.append(f"{key} = {toml_value(value)}")
     if options.bitrate is not None:
         lines.append(f'bitrate = "{options.bitrate:g} bit/s"')
     if any(observed.fd for observed in picture.observed.values()):
         lines.append("fd = true")
     is_used = any(observed.message is not None for observed in picture.observed.values())
-    return lines + ([f"dbc = {quoted(database)}"] if database and is_used else [])
+    return lines + ([f"dbc = {toml_value(database)}"] if database and is_used else [])
 
 
 def can_signal_lines(picture: Picture) -> Iterator[str]:
@@ -339,13 +340,14 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
     names = Counter(signal.name for _, signal, _ in signals)
     for observed, signal, value in signals:
         message = observed.message.name if observed.message and names[signal.name] > 1 else None
-        keys = f"signal = {quoted(signal.name)}" + (f", message = {quoted(message)}" if message else "")
+        keys = f"signal = {toml_value(signal.name)}" + (f", message = {toml_value(message)}" if message else "")
         keys += "" if signal.unit else ', unit = "?"'
-        unit = f"{signal.unit}, " if signal.unit else ""
-        yield f"NAME = {{ {keys} }}  # {unit}{value_text(signal, value.latest)} now"
+        remark = f"{signal.unit}, " if signal.unit else ""
+        remark += f"{value_text(signal, value.latest)} now"
+        yield f"NAME = {{ {keys} }}  {toml_comment(remark)}"
     for name, several in titles.items():
         if name and len(set(several)) > 1:
-            yield f"# {', '.join(several)}: set source_address in [driver] to one of them"
+            yield toml_comment(f"{', '.join(several)}: set source_address in [driver] to one of them")
     yield from _candidate_lines([observed for observed in picture.ordered() if observed.message is None])
 
 
@@ -392,7 +394,7 @@ def _field_line(observed: ObservedFrames, part: Part, layout: Layout) -> str:
     )
     comment = f"? {100 * part.probability:.0f} %: " + spread(part) + (f"; or {others}" if others else "")
     name = f'"0x{observed.identifier:X}"'
-    return f'NAME = {{ id = {name}{extended}{fd}, {bits}, scale = 1.0, unit = "?" }}  # {comment}'
+    return f'NAME = {{ id = {name}{extended}{fd}, {bits}, scale = 1.0, unit = "?" }}  {toml_comment(comment)}'
 
 
 def _start_bit(byte: int, layout: Layout) -> int:

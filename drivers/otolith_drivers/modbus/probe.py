@@ -35,10 +35,10 @@ from otolith_drivers.number_inference import (
     Part,
     number_text,
     parts,
-    quoted,
     register_layouts,
     spread,
 )
+from otolith_drivers.toml_lines import toml_comment, toml_value
 
 # Engineering choices, guarded by tests/drivers/modbus/test_probe.py.
 MAX_TIMES = 1000  # round trips kept of each length of request
@@ -437,7 +437,7 @@ def modbus_driver_lines(place: Place, survey: Survey) -> list[str]:
     for key in keys:
         value = getattr(options, key)
         if key in ("host", "serial", "baudrate", "parity") or value != LineOptions.model_fields[key].default:
-            lines.append(f"{key} = {quoted(value)}")
+            lines.append(f"{key} = {toml_value(value)}")
     lines.append(f"device = {place.device}")
     if place.first_address:
         lines.append(f"first_address = {place.first_address}")
@@ -459,7 +459,7 @@ def modbus_signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
         longer = _longer_readings(place, number, numbers)
         mark = "? " if longer or part.verdict is LayoutVerdict.LIKELY else ""
         comment = f"{mark}{spread(part)}{_alternatives(place, number)}{longer}"
-        lines.append(f'NAME = {{ {register}, type = "{layout.kind}"{order}, unit = "?" }}  # {comment}')
+        lines.append(f'NAME = {{ {register}, type = "{layout.kind}"{order}, unit = "?" }}  {toml_comment(comment)}')
     for verdict, remark in REMARKS.items():
         unknown = [number for number in numbers if number.part.verdict is verdict]
         if unknown:

@@ -396,10 +396,12 @@ def _opcua_document(variable: "Variable") -> dict[str, Any]:
 
 def _opcua_line(variable: "Variable") -> str:
     """Return a line for [signals], with the rest as a comment."""
+    from otolith_drivers.toml_lines import toml_comment, toml_key, toml_value
+
     name = "".join(sign if sign.isalnum() else "_" for sign in variable.path.rpartition("/")[2]) or "signal"
     value = str(variable.value)
     short = value if len(value) <= SHOWN_VALUE else f"{value[:SHOWN_VALUE]}..."
     in_unit, unit = (f" {variable.unit}", "") if variable.unit else ("", ', unit = "?"')
     status = "" if variable.status == "Good" else f", status {variable.status}"
-    node = json.dumps(variable.node, ensure_ascii=False)
-    return f"{name} = {{ node = {node}{unit} }}  # {variable.path}: {short}{in_unit}, {variable.type}{status}"
+    remark = toml_comment(f"{variable.path}: {short}{in_unit}, {variable.type}{status}")
+    return f"{toml_key(name)} = {{ node = {toml_value(variable.node)}{unit} }}  {remark}"
