@@ -158,8 +158,13 @@ class ReasonCounts:
         return [(count, self._examples[kind]) for kind, count in self._counts.most_common(MAX_REASONS)]
 
 
+def is_of_calendar(seconds: float) -> bool:
+    """Return whether a time of the data is Unix time; a log without a date counts from its start."""
+    return CALENDAR[0] <= seconds < CALENDAR[1]
+
+
 def time_text(seconds: float) -> str:
     """Return a time of the data: a date and time of day (UTC) for Unix seconds, else seconds."""
-    if not CALENDAR[0] <= seconds < CALENDAR[1]:
+    if not is_of_calendar(seconds):
         return f"t = {seconds:.2f} s" if 1e3 <= abs(seconds) < CALENDAR[0] else f"t = {round(seconds, 9) + 0.0:.4g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S.%f}"[:-4] + " UTC"

@@ -20,6 +20,7 @@ from otolith_drivers.errors import ServiceError
 
 SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
 INSTALLED = Path("/etc/otolith")  # their machine files
+DEMOS = "demo"  # folder in the state directory with one for each demo, whose names sort by time
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
 FILE = click.Path(path_type=Path, dir_okay=False)
 MACHINE_FILE = click.argument("file", type=FILE)

@@ -8,13 +8,14 @@ import csv
 import json
 import os
 import queue
+import shlex
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from rich.table import Table
 
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import initial_state
-from otolith.cli.common import INTERRUPTED, drain, local_time
+from otolith.cli.common import DEMOS, INTERRUPTED, drain, local_time
 from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
@@ -34,6 +35,8 @@ from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
 from otolith.publishing.zenoh_session import REPORT
 from otolith.runtime.process import ChildProcess
+from otolith.storage.history import path_in
+from otolith.storage.recording_files import STAMP
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
@@ -169,9 +172,11 @@ class Demo:
         self._machine, self._scenario = load_machine(machine), load_scenario(scenario)
         self._transports = transports_of(self._machine)
         self._scenario_file, self._duration, self._as_json = scenario, duration, as_json
-        stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
-        self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
-        self._recording = self._folder / "recording.rrd"
+        begun, names = datetime.now().astimezone(), self._machine.file.machine
+        self._folder = writable(state_directory() / DEMOS / f"{begun.strftime(STAMP)}-{os.getpid()}")
+        stamp = begun.astimezone(UTC).strftime(STAMP)
+        self._recording = self._folder / f"{names.site}.{names.name}-{stamp}-{os.getpid()}.rrd"
+        self._history = path_in(self._folder / "history", names.site, names.name)
         self._console = Console(stderr=as_json)
         self._reports: list[ReportDocument] = []
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -298,9 +303,16 @@ class Demo:
         self._print_events(sorted(events.values(), key=lambda event: event.start))
         if (health := self._health) is not None:
             self._print(f"state of the machine: {headline(health, local_time)}", LEVEL_STYLES[health.state])
-        self._print(f"recording: {self._recording}")
-        self._print(f"open it with: {Path(sys.executable).with_name('otolith')} view {self._recording}")
+        for line in self._closing_lines():
+            self._print(line)
         return 0 if right else 1
+
+    def _closing_lines(self) -> Iterator[str]:
+        """Yield the commands that show what the demo has left, as they can be pasted into a shell."""
+        program = Path(sys.executable).with_name("otolith")
+        yield f"recording: {shlex.join(map(str, (program, 'view', self._recording)))}"
+        if self._history.exists():  # unless the machine file disables it
+            yield f"report page: {shlex.join(map(str, (program, 'report', self._history)))}"
 
     def _print_events(self, events: Iterable[EventDocument]) -> None:
         for event in events:

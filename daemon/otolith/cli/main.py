@@ -169,10 +169,21 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
 @DATA_FILES
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
 @click.option("--recording", type=FILE, callback=_new_recording, help="Record into this file, as the daemon does.")
+@click.option("--report", "page", type=FILE, callback=new_file, metavar="FILE",
+              help="Write this new HTML page, as 'otolith report' does.")  # fmt: skip
+@click.option("--history", "folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+              help="Keep the history of the reports in this folder.")  # fmt: skip
 @click.option("--real-time", is_flag=True, help="Wait for the end of each window, as in operation.")
 @click.option("--timing", is_flag=True, help="Add computing times, which differ from run to run.")
 def replay(
-    file: Path, data: tuple[Path, ...], as_json: bool, recording: Path | None, real_time: bool, timing: bool
+    file: Path,
+    data: tuple[Path, ...],
+    as_json: bool,
+    recording: Path | None,
+    page: Path | None,
+    folder: Path | None,
+    real_time: bool,
+    timing: bool,
 ) -> int:
     """Run recorded DATA through the daemon for the machine in FILE.
 
@@ -189,12 +200,13 @@ def replay(
       otolith replay my-machine.toml monday.blf --real-time
       otolith replay my-machine.toml monday.csv --json | jq .parameters.R_a.value
       otolith replay my-machine.toml monday.csv --recording monday.rrd
+      otolith replay my-machine.toml monday.csv --report monday.html
     """
     from otolith.cli.replay import replay
 
     stop = StopSignal()
     options = {"as_json": as_json, "real_time": real_time, "timing": timing}
-    replay(file, data, recording, stopped=stop.received, **options)
+    replay(file, data, recording, stopped=stop.received, page=page, folder=folder, **options)
     return stop.code()
 
 

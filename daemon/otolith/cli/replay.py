@@ -3,9 +3,10 @@
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 
 import click
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -24,6 +25,7 @@ from otolith.runtime.preview import computing_time_text, preview_recording, shor
 from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import OtolithError, counted
+from otolith_drivers.user_dirs import writable
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
 PREVIEWED_ROWS = 50_000  # of which a replay prints a preview
@@ -111,14 +113,17 @@ def replay(
     stopped: Callable[[], bool],
     real_time: bool = False,
     timing: bool = False,
+    page: Path | None = None,
+    folder: Path | None = None,
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
     Each file of ``data`` is a recording of its own. With ``timing`` reports have computing times, which differ from run
-    to run.
+    to run. The history of the reports is kept in ``folder``, and drawn as the new HTML file ``page``.
 
     Raises:
-        OtolithError: a file that cannot be used.
+        OtolithError: a file that cannot be used, or that cannot be written.
+        OSError: the page cannot be written.
     """
     machine = load_machine(file, with_driver=False)
     summary = ReplaySummary()
@@ -132,11 +137,13 @@ def replay(
         run.state = _with_decisions(machine, run.state)
         with (
             replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
+            _history(machine, run, data, page, folder) as keep,
             progress_line("reading", enabled=not as_json) as show,
         ):
             for report in run.reports():
                 summary.add(report.document)
                 record(report)
+                keep(report.document)
                 show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
                 if as_json:
                     click.echo(report.document.to_json())
@@ -147,6 +154,32 @@ def replay(
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _history(
+    machine: LoadedMachine, run: Replay, data: Sequence[Path], page: Path | None, folder: Path | None
+) -> Iterator[Callable[[ReportDocument], None]]:
+    """Yield what keeps a report for ``page`` and in ``folder``, and draw the page at the end; nothing without both."""
+    if page is None and folder is None:
+        yield lambda _: None
+        return
+    from otolith.cli.operation.history import page_of, write_page
+    from otolith.storage.history import describe_machine
+    from otolith.storage.log_history import log_history
+
+    names = machine.file.machine
+    if page is not None:
+        writable(page.absolute().parent)
+    with (
+        TemporaryDirectory(prefix="otolith-replay-") as temporary,
+        log_history(folder or Path(temporary), names.site, names.name) as history,
+    ):
+        yield history.add
+        log = {"files": [path.name for path in data], "warnings": run.warnings()}
+        history.describe(describe_machine(machine.twin, run.state.plan, log))
+        if page is not None and history.span is not None:
+            write_page(page, page_of(history.reader, *history.span))
 
 
 def _with_decisions(machine: LoadedMachine, state: AdaptationState) -> AdaptationState:

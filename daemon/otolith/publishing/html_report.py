@@ -1,7 +1,8 @@
 """The history of a machine as one HTML page that refers to no other file: state in words, curves, events, equations.
 
 The page is ``report.html``, a template that has the texts and escapes what it inserts. This module computes what it
-shows. Times are Unix seconds. Positions are in percent of a plot, from its left and from its top.
+shows. Times are Unix seconds, or those of a log without a time of day. Positions are in percent of a plot, from its
+left and from its top.
 """
 
 import math
@@ -19,6 +20,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from otolith import __version__
+from otolith.acquisition.quality import is_of_calendar
 from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
@@ -71,6 +73,9 @@ class Axis:
         """Return position and text of the marks of time, at round local times."""
         span = self.end - self.begin
         step = next((step for step in STEPS if span / step < MAX_TICKS), STEPS[-1])
+        if not is_of_calendar(self.begin):
+            first = math.ceil(self.begin / step) * step
+            return [(self.x(at), f"{at} s") for at in range(first, math.floor(self.end) + 1, step)]
         form = "%H:%M:%S" if step < 60 else "%H:%M" if span < DAY else texts("day_and_time" if step < DAY else "day")
         form = texts("month") if step > 30 * DAY else form
         zone = time.localtime(self.begin).tm_gmtoff
@@ -110,6 +115,8 @@ def html_report(
 ) -> str:
     """Return the page about the time from ``since`` to ``now``, from ``samples`` of each ``interval``.
 
+    If nobody continues the history, ``now`` is the end of its last window.
+
     Raises:
         ConfigurationError: the history cannot be read.
         ValueError: a document in it cannot be read.
@@ -121,7 +128,7 @@ def html_report(
     silence = now - latest.window.end if latest else 0.0
     is_silent = latest is None or silence > SILENT_WINDOWS * (latest.window.end - latest.window.start)
     begins = [row.time for row in rows[:1]] + [row.entered for row in states[:1]]
-    begin = max(since, min([*begins, latest.window.start if latest else since]))
+    begin = since if "log" in description else max(since, min([*begins, latest.window.start if latest else since]))
     until = latest.window.end if latest and not is_silent and silence > -DAY else now
     axis = _axis(min(begin, until - 1.0), until, latest)
     gaps = _gaps(sorted({row.time for row in rows}), length) + ([(latest.window.end, until)] if latest else [])
@@ -132,17 +139,23 @@ def html_report(
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     say = texts_in(latest.health.language if latest and latest.health else "en")
-    own = {"when": lambda at: time.strftime("%F %T", time.localtime(at)), "words": say.translated}
+    own = {"when": _time_of_day if is_of_calendar(axis.begin) else text.moment_text, "words": say.translated}
     environment.filters |= vars(text) | own | {"whole": whole}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
+    zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
+    is_over = latest is not None and now <= latest.window.end
     return template.render(
         say=say, machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
-        zone=time.strftime("%Z", time.localtime(now)), lanes=list(_lanes(axis, latest, states)), curves=curves,
+        zone=zone, lanes=list(_lanes(axis, latest, states)), curves=curves, is_over=is_over,
         gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,
         findings=reader.findings(since), undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
     )  # fmt: skip
+
+
+def _time_of_day(seconds: float) -> str:
+    return time.strftime("%F %T", time.localtime(seconds))
 
 
 def whole(written: str) -> Markup:

@@ -81,17 +81,25 @@ def history_directory() -> Path:
 
 def history_path(site: str, machine: str) -> Path:
     """Return the path of a machine's database; raises as :func:`history_directory`."""
-    return history_directory() / f"{site}.{machine}{SUFFIX}"
+    return path_in(history_directory(), site, machine)
 
 
-def describe_machine(twin: Definition, plan: MonitoringPlan) -> str:
-    """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter."""
+def path_in(folder: Path, site: str, machine: str) -> Path:
+    """Return the path of a machine's database in a folder."""
+    return folder / f"{site}.{machine}{SUFFIX}"
+
+
+def describe_machine(twin: Definition, plan: MonitoringPlan, log: Mapping[str, Any] | None = None) -> str:
+    """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter.
+
+    ``log`` tells of the data that were replayed: ``files``, their names, and ``warnings``, what a reader must know.
+    """
     sides = [(name, text) for name, text, _ in twin.definitions]
     values = {row.name: (row.nominal, row.unit, row.meaning) for row in twin.parameters if row.role is not Role.SETTING}
     limits = {name: [(row.level, row.value, row.is_lower) for row in quantity.limits]
               for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
-    texts = {"title": twin.title, "equations": [*twin.equations, *sides]}
+    texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
     return json.dumps({**texts, "values": values, "limits": limits, "sites": sites}, ensure_ascii=False)
 
 

@@ -8,14 +8,14 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from otolith.cli.common import AS_JSON, FILE, local_time, new_file, progress_line, use_state_of_service
+from otolith.cli.common import AS_JSON, DEMOS, FILE, local_time, new_file, progress_line, use_state_of_service
 
 if TYPE_CHECKING:
     from otolith.health.schema import EventDocument
@@ -36,12 +36,24 @@ WIDTH_WITH_RANGE = 100  # characters of a terminal that shows them
 FORGED = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
 
-def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
-    """Return the Unix time that ``text`` means: an age like ``30d``, or a date and time of this computer's zone."""
+@dataclass(frozen=True, slots=True)
+class Since:
+    """Where a time begins: at a date, or so long before its end."""
+
+    date: float | None = None  # Unix s
+    age: float = 0.0  # s
+
+    def before(self, end: float) -> float:
+        """Return the begin, in s as ``end``."""
+        return end - self.age if self.date is None else self.date
+
+
+def age_or_date(_: click.Context, __: click.Parameter, text: str) -> Since:
+    """Return what ``text`` means: an age like ``30d``, or a date and time of this computer's zone."""
     if match := re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip()):
-        return time.time() - float(match[1]) * SPANS[match[2]]
+        return Since(age=float(match[1]) * SPANS[match[2]])
     try:
-        return datetime.fromisoformat(text).timestamp()
+        return Since(datetime.fromisoformat(text).timestamp())
     except (ValueError, OverflowError) as error:
         raise click.BadParameter(f"{text!r}: write an age like 12h, 30d or 8w, or a date like 2026-01-31") from error
 
@@ -58,7 +70,7 @@ def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
 @click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
 def history(
     machine: str,
-    since: float,
+    since: Since,
     names: tuple[str, ...],
     every: str | None,
     only_events: bool,
@@ -86,25 +98,29 @@ def history(
         raise click.UsageError("--parquet has values only: give --csv or --json with --events")
     reader = reader_of(machine)
     _check_names(names, reader.names())
-    events = [] if names and not only_events else reader.events(since)
+    end = end_of(reader)
+    begin = since.before(end)
+    events = [] if names and not only_events else reader.events(begin)
     if only_events and as_csv:
         _print_events(events)
         return
-    interval = every or interval_since(reader, since)
-    samples = [] if only_events else samples_since(reader, interval, since, names)
+    interval = every or interval_since(reader, begin, end)
+    samples = [] if only_events else samples_since(reader, interval, begin, names)
     if as_csv:
         _print_samples(samples)
     elif parquet is not None:
         _write_parquet(samples, parquet)
     elif as_json:
-        _print_json(reader, interval, since, samples, events)
+        _print_json(reader, interval, begin, samples, events)
     else:
-        bundles = _bundles(reader, since) if only_events else {}
-        _print_table(reader, interval, since, samples, events, bundles, with_findings=only_events or not names)
+        bundles = _bundles(reader, begin) if only_events else {}
+        _print_table(reader, interval, begin, samples, events, bundles, with_findings=only_events or not names)
 
 
 def reader_of(machine: str) -> "HistoryReader":
     """Return the history in a file, of a machine file, or of a machine by its name or that of its service.
+
+    If there is none of that name, it is that of the last demo, which is said on standard error.
 
     Raises:
         ConfigurationError: the file is wrong, or there is no history, or several, of that name.
@@ -126,12 +142,27 @@ def reader_of(machine: str) -> "HistoryReader":
     if not chosen and use_state_of_service(machine):
         return reader_of(machine)
     if not chosen:
-        hint = nearest(machine, [reader.machine for reader in known])
+        demos = {reader.machine: reader for reader in _demos()}  # the last one of each name
+        if machine in demos:
+            click.echo(
+                f"no machine is named {machine!r}: this is the demo in {demos[machine].path.parents[1]}", err=True
+            )
+            return demos[machine]
+        hint = nearest(machine, [*(reader.machine for reader in known), *demos])
         raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")
     if len(chosen) > 1:
         sites = ", ".join(reader.site for reader in chosen)
         raise ConfigurationError(f"several machines are named {machine!r}, at {sites}: give the machine file")
     return chosen[0]
+
+
+def _demos() -> "list[HistoryReader]":
+    """Return the histories that demos left, in the order of time."""
+    from otolith.storage.history import SUFFIX, HistoryReader
+    from otolith_drivers.user_dirs import state_directory
+
+    paths = (state_directory() / DEMOS).glob(f"*/history/*{SUFFIX}")
+    return [HistoryReader(path) for path in sorted(paths)]
 
 
 def _check_names(names: Sequence[str], known: list[str]) -> None:
@@ -142,13 +173,21 @@ def _check_names(names: Sequence[str], known: list[str]) -> None:
             raise ConfigurationError(f"no value of {name!r} in the history: {nearest(name, known)}")
 
 
-def interval_since(reader: "HistoryReader", since: float) -> str:
-    """Return the resolution that shows the time since then, as far as there are values."""
+def end_of(reader: "HistoryReader") -> float:
+    """Return the present time, in Unix s; of a history that no daemon continues the end of its last window."""
+    from otolith.storage.history import history_directory
+
+    latest = [] if reader.path.parent == history_directory() else reader.latest(1)
+    return latest[0].window.end if latest else time.time()
+
+
+def interval_since(reader: "HistoryReader", since: float, end: float) -> str:
+    """Return the resolution that shows the time from ``since`` to ``end``, as far as there are values."""
     from otolith.storage.history import DAY, RESOLUTIONS
 
     firsts = [first for seconds in RESOLUTIONS if (first := reader.first(seconds)) is not None] or [since]
     begin = max(first for first in firsts if first < min(firsts) + DAY)  # coarse intervals begin before their values
-    span = time.time() - max(since, begin)
+    span = end - max(since, begin)
     return next((name for name, longest in LONGEST.items() if span <= longest), "day")
 
 
@@ -298,7 +337,7 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
 @click.option("--since", default="7d", callback=age_or_date, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
 @click.option("--output", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True), callback=new_file,
               metavar="FILE", help="Write this new file; '-' prints.  [default: MACHINE-TIME.html]")  # fmt: skip
-def report(machine: str, since: float, output: Path | None) -> None:
+def report(machine: str, since: Since, output: Path | None) -> None:
     """Write what was estimated and announced as one HTML page.
 
     FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
@@ -311,22 +350,39 @@ def report(machine: str, since: float, output: Path | None) -> None:
       otolith report press-3 --since 2026-01-31 --output press-3.html
       otolith report press-3 --since 1d --output - > /srv/www/press-3.html
     """
-    from otolith.publishing.html_report import html_report
-    from otolith_drivers.errors import ConfigurationError
-
     reader, now = reader_of(machine), time.time()
-    if since >= now:
+    end = end_of(reader)
+    begin = since.before(end)
+    if begin >= now:
         raise click.BadParameter("lies in the future", param_hint="'--since'")
-    interval = interval_since(reader, since)
-    try:
-        page = html_report(reader, samples_since(reader, interval, since, ()), interval, since, now)
-    except ValueError as error:
-        raise ConfigurationError(f"{reader.path}: cannot be read: {error}") from error
-    content = page.encode(errors="backslashreplace")  # a text of a machine may have half a character
+    content = page_of(reader, begin, end)
     if output == Path("-"):
         sys.stdout.buffer.write(content)
         return
     path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
+    write_page(path, content)
+    click.echo(path)
+
+
+def page_of(reader: "HistoryReader", since: float, end: float) -> bytes:
+    """Return the page about the time from ``since`` to ``end``.
+
+    Raises:
+        ConfigurationError: the history cannot be read.
+    """
+    from otolith.publishing.html_report import html_report
+    from otolith_drivers.errors import ConfigurationError
+
+    interval = interval_since(reader, since, end)
+    try:
+        page = html_report(reader, samples_since(reader, interval, since, ()), interval, since, end)
+    except ValueError as error:
+        raise ConfigurationError(f"{reader.path}: cannot be read: {error}") from error
+    return page.encode(errors="backslashreplace")  # a text of a machine may have half a character
+
+
+def write_page(path: Path, content: bytes) -> None:
+    """Write a new file, whole or not at all; raise OSError with its name."""
     with path.open("xb") as file:
         try:
             file.write(content)
@@ -335,7 +391,6 @@ def report(machine: str, since: float, output: Path | None) -> None:
             path.unlink()
             error.filename = str(path)
             raise
-    click.echo(path)
 
 
 @click.command()

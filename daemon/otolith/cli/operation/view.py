@@ -15,8 +15,8 @@ from typing import BinaryIO
 
 import click
 
-from otolith.cli.common import SERVICES, local_time
-from otolith.cli.operation.history import age_or_date
+from otolith.cli.common import DEMOS, SERVICES, local_time
+from otolith.cli.operation.history import Since, age_or_date
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
@@ -36,7 +36,7 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
 @click.option("--live", is_flag=True, help="Show what is added to it as well.")
 @click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
-def view(recording: str | None, since: float | None, only_list: bool, live: bool, web: bool) -> int:
+def view(recording: str | None, since: Since | None, only_list: bool, live: bool, web: bool) -> int:
     """Open the newest recording, or FILE, in the Rerun viewer.
 
     MACHINE is the name of the machine that it is of, with or without its site, or an instance of the service.
@@ -55,16 +55,16 @@ def view(recording: str | None, since: float | None, only_list: bool, live: bool
         if since or only_list:
             raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
         return follow(lambda: path, web=web) if live else open_viewer([path], web=web)
-    known = Recordings.search(recording or "")
-    files = [file for file in known.files if since is None or file.end >= since]
+    known, begin = Recordings.search(recording or ""), since.before(time.time()) if since else None
+    files = [file for file in known.files if begin is None or file.end >= begin]
     if only_list:
         width = max((len(file.key) for file in files), default=0)
         click.echo("".join(f"{_row(file, width)}\n" for file in files), nl=False)
-        for line in known.unreadable if files else [known.none_text(since)]:
+        for line in known.unreadable if files else [known.none_text(begin)]:
             click.echo(line, err=True)
         return 0
     if not files:
-        raise ConfigurationError(known.none_text(since))
+        raise ConfigurationError(known.none_text(begin))
     if live:
         return follow(lambda: _newest(recording or "", files[0]), web=web)
     return open_viewer([file.path for file in (files[:1] if since is None else reversed(files))], web=web)
@@ -95,6 +95,9 @@ class Recordings:
             is_instance = machine == place.name and place != own
             files |= {path: file for path, file in of_place.items() if is_instance or _is_of(file, machine)}
         newest_first = sorted(files.values(), key=lambda file: file.end, reverse=True)
+        if machine:  # a demo is shown if there is no machine of that name
+            machines = [file for file in newest_first if not file.path.is_relative_to(own / DEMOS)]
+            newest_first = machines or newest_first
         return cls(machine, (own, SERVICES), tuple(newest_first), tuple(unreadable))
 
     def none_text(self, since: float | None) -> str:
