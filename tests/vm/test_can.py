@@ -33,6 +33,7 @@ from tests.vm.conftest import (
 FRAMES = 200  # per second, of the plant
 MAX_ROUNDS = 10  # in which the dump of the bus is played
 OURS = ("181", "281")
+WITNESS_BYTES = 8 << 20  # that the kernel keeps for candump while the computer is busy: a minute of the plant's frames
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def live(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Live:
     with machine_on_a_bus(tmp_path_factory.mktemp("live")) as machine:
         _, listener = machine.daemon()
         before = transmitted()
-        dump = machine.start("candump", "-L", CHANNEL)
+        dump = machine.start("candump", "-L", "-r", str(WITNESS_BYTES), CHANNEL)
         plant = machine.plant()
         reports = listener.wait_for_good(10)
         plant.stop()
@@ -171,9 +172,8 @@ def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Progra
     last = counters(reports)
     assert (last.bad, last.lost, last.reconnects) == (before.bad, before.lost, before.reconnects)
     check_missed(before, last)
-    driver = reports[-1].driver
-    assert driver is not None
-    assert any("3 error frames" in line for line in driver.warnings)
+    warnings = {line for report in reports if report.driver is not None for line in report.driver.warnings}
+    assert any("3 error frames" in line for line in warnings)  # of a while ago, on a busy computer
 
 
 def test_short_frames_of_our_own_identifiers_are_counted(watched: Watched, plant: Program) -> None:
