@@ -9,6 +9,7 @@ need whose signals arrive as plain numbers: :class:`ScaledSource` for the machin
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
@@ -236,3 +237,15 @@ class Conversion:
             return math.nan
         value = self.to_target[0] * written + self.to_target[1]
         return value if math.isfinite(value) else math.nan
+
+    def why_no_value(self, number: object) -> str:
+        """Return why :meth:`value` is NaN for ``number``, with value and range, in the unit of the source."""
+        if not isinstance(number, bool | int | float):
+            return "is no number"
+        with suppress(OverflowError):
+            written = self.source.scale * float(number) + self.source.offset
+            if self.source.range is not None and math.isfinite(written):
+                low, high = self.source.range
+                unit = self.source.unit or "in the unit of the source"
+                return f"is {written:.6g} {unit}, out of its range from {low:g} to {high:g}"
+        return "is not finite"

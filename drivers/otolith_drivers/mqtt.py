@@ -25,7 +25,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, ScaledSource, Setup, Signal
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.message_times import ArrivalClock, PeriodEstimator, unix_time
-from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver, cause_of
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver, cause_of
 from otolith_drivers.errors import ConfigurationError, counted, shown
 from otolith_drivers.units import Quantity
 
@@ -213,7 +213,7 @@ class Messages:
             written = content if path is None else at(content, path)
             written = float(written) if isinstance(written, str) and NUMBER.fullmatch(written.strip()) else written
             value = conversion.value(written)
-            fault = f"{name} is {shown(written)}, no number in its range" if math.isnan(value) else ""
+            fault = f"{name} {shown(written)} {conversion.why_no_value(written)}" if math.isnan(value) else ""
         except ValueError as error:
             value, fault = math.nan, str(error)
         if fault:
@@ -288,6 +288,7 @@ class MqttListener(ThreadedDriver):
         super().__init__()
         self._options, self._messages, self._password, self._tls = options, messages, password, tls
         self._connection = Reconnection(options.title(), log)
+        self._own_faults = OwnFaults(log)
         self._begun = 0.0  # s; when the broker accepted the subscription
         self._refusal = ""  # why the broker accepts neither client nor topic
 
@@ -313,7 +314,8 @@ class MqttListener(ThreadedDriver):
             wall = time.time() - now
             ends = [f"{-wall - offset:+.4g} s" for offset in {min(offsets), max(offsets)}]
             facts.append(f"the senders' clocks minus this computer's: {' to '.join(sorted(ends))}, less the way here")
-        return Link(up, reason, tuple(lines) if up else (), ", ".join(facts))
+        defect = self._own_faults.defect(now)
+        return Link(up, reason, tuple(lines) if up else (), ", ".join(facts), defect=defect)
 
     def describe(self) -> list[str]:
         stamps = "times of arrival" if self._options.time is None else f"times of the field {self._options.time}"
@@ -332,6 +334,8 @@ class MqttListener(ThreadedDriver):
             try:
                 self._listen(client)
             except Exception as error:  # noqa: BLE001 - nothing that a broker sends may end the thread
+                if not isinstance(error, OSError | ValueError):
+                    self._own_faults.note(error, "a connection to the broker", time.monotonic())
                 self._connection.go_down(_cause(error))
             finally:
                 client.disconnect()
@@ -365,11 +369,13 @@ class MqttListener(ThreadedDriver):
                 self._connection.come_up("subscribed")
 
         def on_message(_: Any, __: Any, message: mqtt.MQTTMessage) -> None:
-            samples = self._messages.take(
-                message.topic, bytes(message.payload), time.monotonic(), retained=message.retain
-            )
-            if samples and not self._stop.is_set():
-                deliver(samples)
+            now = time.monotonic()
+            try:
+                samples = self._messages.take(message.topic, bytes(message.payload), now, retained=message.retain)
+                if samples and not self._stop.is_set():
+                    deliver(samples)
+            except Exception as error:  # noqa: BLE001 - no message may end the connection
+                self._own_faults.note(error, f"reading a message of {shown(message.topic)}", now)
 
         client.on_connect, client.on_subscribe, client.on_message = on_connect, on_subscribe, on_message
         return client

@@ -4,6 +4,7 @@
 is intact and new, and reads its signals. No clock in here: the time of a frame is an argument.
 """
 
+import logging
 import math
 import threading
 from collections import defaultdict
@@ -47,8 +48,10 @@ from otolith_drivers.canbus.options import (
     request_from_databases,
 )
 from otolith_drivers.common.message_times import PeriodEstimator, period_text
-from otolith_drivers.common.reconnection import PassingFault
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault
 from otolith_drivers.errors import ConfigurationError, nearest
+
+log = logging.getLogger(__name__)
 
 NO_READING = float("nan")
 NO_SAMPLES: list[Sample] = []
@@ -79,12 +82,13 @@ class _MultiplexedGroup:
 
     title: str
     condition: Condition
+    needed: int  # Bytes of a frame that contains its multiplexers
     rows: list[Row] = field(default_factory=list)
     periods: PeriodEstimator = field(default_factory=PeriodEstimator)
     lost: int = 0
 
     def is_in(self, data: bytes | bytearray) -> bool:
-        return all(read(data) in values for read, values in self.condition)
+        return len(data) >= self.needed and all(read(data) in values for read, values in self.condition)
 
 
 class MessageReader:
@@ -104,12 +108,14 @@ class MessageReader:
         longest = max((ms for ms in cycles if isinstance(ms, int | float)), default=0)
         self._database_period = 1e-3 * min(longest, MAX_CYCLE_TIME)
         self._rows: list[Row] = []
+        self._needed: dict[str, int] = {}  # Bytes of a frame that contains each signal
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
         self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)  # Frames or values, by their kind
         self._standard = {request.name: request.signal for request in requests if rules.is_j1939}
         self._named = {request.name: names_of_no_reading(request.signal) for request in requests}
         for request in requests:
-            self._length = max(self._length, bytes_needed(request.signal))
+            self._needed[request.name] = bytes_needed(request.signal)
+            self._length = max(self._length, self._needed[request.name])
             high = min(request.raw_high, highest_reading(request.signal) if rules.is_j1939 else math.inf)
             read, limits = raw_reader(request.signal), (request.raw_low, high)
             row = (request.name, read, *limits, request.scale, request.offset, request.target_unit)
@@ -122,24 +128,32 @@ class MessageReader:
 
     def take(self, data: bytes | bytearray, time: float) -> list[Sample]:
         """The samples of a frame of ``time`` (s); none if it is corrupted or repeats the last one."""
-        if len(data) < self._length or (self._checksum is not None and not self._checksum(data)):
+        is_short = len(data) < self._length
+        if (is_short and not self._is_of_use(data)) or (self._checksum is not None and not self._checksum(data)):
             return self._reject(data, time)
-        if self._counter is not None:
-            lost = self._counter.lost_before(data, time, self.periods)
-        else:
+        lost: int | None
+        if self._counter is None or len(data) < self._counter.needed:
             lost = self.periods.lost_before(time)
+        else:
+            lost = self._counter.lost_before(data, time, self.periods)
         if lost is None:
             self.bad += 1
             return NO_SAMPLES
         if lost:
             self._lost += lost * len(self._rows)
         rows = self._rows if not self._groups else self._rows + self._multiplexed_rows(data, time)
+        if is_short:
+            if self._counter is not None and len(data) < self._counter.needed:
+                self._counter.note_corrupted()
+            rows, missing = self._split_rows(data, rows, time)
         samples = [
             Sample(name, time, scale * raw + offset)
             if low <= (raw := read(data)) <= high
             else self._no_reading((name, read, low, high, scale, offset, unit), time, raw)
             for name, read, low, high, scale, offset, unit in rows
         ]
+        if is_short:
+            samples += [Sample(name, time, NO_READING) for name in missing]
         self.received += len(samples)
         return samples
 
@@ -183,7 +197,8 @@ class MessageReader:
         if key not in self._groups:
             when = " and ".join(f"{switch.name} = {_few(values)}" for switch, values in switches)
             condition = tuple((raw_reader(switch), values) for switch, values in switches)
-            self._groups[key] = _MultiplexedGroup(f"{self.title} with {when}", condition)
+            needed = max(bytes_needed(switch) for switch, _ in switches)
+            self._groups[key] = _MultiplexedGroup(f"{self.title} with {when}", condition, needed)
         return self._groups[key].rows
 
     def _multiplexed_rows(self, data: bytes | bytearray, time: float) -> list[Row]:
@@ -194,6 +209,25 @@ class MessageReader:
                 group.lost += group.periods.lost_before(time) * len(group.rows)
                 rows += group.rows
         return rows
+
+    def _is_of_use(self, data: bytes | bytearray) -> bool:
+        """Whether a frame that is too short has a wanted signal; without the bytes of its checksum it has none."""
+        return self._checksum is None and any(needed <= len(data) for needed in self._needed.values())
+
+    def _split_rows(self, data: bytes | bytearray, rows: list[Row], time: float) -> tuple[list[Row], list[str]]:
+        """The rows of which the bytes are in a frame that is too short, and the names of the others, counted."""
+        within = [row for row in rows if self._needed[row[0]] <= len(data)]
+        missing = [row[0] for row in rows if row not in within]
+        what = f"without {', '.join(missing)}" if missing else "with all signals that are read"
+        short = f"a frame of {len(data)} bytes instead of {self._length}, {what}"
+        self._rejections["short"].note(short, time)
+        self.bad += len(missing)
+        return within, missing
+
+    @property
+    def rejections(self) -> list[PassingFault]:
+        """Frames and values that could not be used, by their kind."""
+        return list(self._rejections.values())
 
     def _no_reading(self, row: Row, time: float, raw: float) -> Sample:
         name, _, low, high, scale, offset, unit = row
@@ -280,6 +314,7 @@ class FrameDecoder:
             key: handler for node in nodes for key, handler in node.handlers.items()
         }
         self._unreadable = 0
+        self._own_faults = OwnFaults(log)
         self._begun: float | None = None
         self._lock = threading.Lock()  # Of all that frames change
 
@@ -312,8 +347,11 @@ class FrameDecoder:
                 key, data, time = self._groups.key(message), message.data, message.time
             reader = self._readers.get(key)
             return reader.take(data, time) if reader is not None else NO_SAMPLES
-        except Exception:  # noqa: BLE001 - interfaces deliver unchecked what was on the wire
+        except Exception as error:  # noqa: BLE001 - no frame may end the thread
+            written, identifier = getattr(frame, "data", None), getattr(frame, "arbitration_id", None)
             self._unreadable += 1
+            if isinstance(written, bytes | bytearray) and isinstance(identifier, int):  # else the interface is at fault
+                self._own_faults.note(error, f"decoding frame 0x{identifier:X} with data {written.hex(' ')}", time)
             return NO_SAMPLES
 
     @property
@@ -343,6 +381,17 @@ class FrameDecoder:
             for node in self._nodes:
                 lines += node.warnings(now)
         return lines
+
+    def defect(self, now: float) -> str:
+        """What this program did wrong lately at ``now`` (s); empty if nothing."""
+        with self._lock:
+            return self._own_faults.defect(now)
+
+    def latest_rejection(self) -> str:
+        """Why the latest frame or value that was not used could not be; empty without any."""
+        with self._lock:
+            faults = [fault for reader in self._readers.values() for fault in reader.rejections]
+            return max(faults, key=lambda fault: fault.time).text if faults else ""
 
     @property
     def latency(self) -> float:

@@ -22,7 +22,7 @@ from otolith_drivers.canbus.bus import (
 )
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CanSource, FrameOptions
-from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
+from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,8 @@ class CanReceiver(ThreadedDriver):
         super().__init__()
         self._options, self._decoder = options, decoder
         self._connection = Reconnection(f"CAN bus {options.title()}", log)
-        self._unreadable = self._consecutive_bad = 0
+        self._unreadable = PassingFault()  # Frames that python-can cannot unpack
+        self._consecutive_bad = 0
         self._drops = DropCounter()
         self._last_frame = self._opened = 0.0
         self._gathers = False
@@ -78,7 +79,7 @@ class CanReceiver(ThreadedDriver):
         counters = self._decoder.counters
         return replace(
             counters,
-            bad=counters.bad + self._unreadable,
+            bad=counters.bad + self._unreadable.count,
             # The period or the counter of a message shows dropped frames as well, unless it has neither.
             lost=max(counters.lost, self._drops.total),
             reconnects=self._connection.count,
@@ -93,8 +94,9 @@ class CanReceiver(ThreadedDriver):
         now = time.monotonic()
         silence = now - self._last_frame
         silent = [f"no frame at all for {silence:.1f} s"] if silence > self._silence_limit() else []
-        warnings = (*silent, *self._drops.warnings(now), *self._decoder.warnings(now))
-        return Link(up=True, warnings=warnings, latency=self._decoder.latency)
+        unreadable = self._unreadable.warnings(now)
+        warnings = (*silent, *unreadable, *self._drops.warnings(now), *self._decoder.warnings(now))
+        return Link(up=True, warnings=warnings, latency=self._decoder.latency, defect=self._decoder.defect(now))
 
     def describe(self) -> list[str]:
         return [f"CAN bus {self._options.title()}, receive only", *self._decoder.describe()]
@@ -189,7 +191,7 @@ class CanReceiver(ThreadedDriver):
         if is_gone(error):
             return False
         self._consecutive_bad += 1
-        self._unreadable += 1
+        self._unreadable.note(f"a frame cannot be unpacked ({type(error).__name__}: {error})", time.monotonic())
         return self._consecutive_bad <= MAX_CONSECUTIVE_BAD
 
     def _reconnect(self) -> can.BusABC | None:

@@ -13,7 +13,7 @@ import can
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
-from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable, RawReader, raw_reader
+from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable, RawReader, bytes_needed, raw_reader
 from otolith_drivers.common.message_times import PeriodEstimator
 
 # Thresholds; docs/reference/thresholds-canbus.md gives the origin of each.
@@ -43,6 +43,7 @@ class FrameCounter:
         self.name = signal.name
         self.declared = declared
         self.modulo = modulo or _modulo(signal)
+        self.needed = bytes_needed(signal)  # Bytes of a frame that contains it
         self.repeated = 0  # Frames in a row that have repeated the last count
         self._read: RawReader = raw_reader(signal)
         self._trusted = declared

@@ -7,6 +7,7 @@ import random
 import ssl
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 LASTING = 1.0  # s; a connection that lasted so long works, and the next pause is the shortest one again
 FAULT_SHOWN = 10.0  # s after which a passing fault is no longer a warning
 CLOSE_TIMEOUT = 0.9  # s for the thread to end
+MAX_KINDS = 20  # kinds of exceptions of a driver that are logged
 
 
 class ReconnectBackoff:
@@ -94,6 +96,32 @@ class PassingFault:
         age = max(now - self.time, 0.0)
         line = f"{title}: {self.text}" if title else self.text
         return [f"{line}; {self.count} in all, the last {age:.1f} s ago"] if age < FAULT_SHOWN else []
+
+
+class OwnFaults:
+    """Exceptions of a driver's own code: counted apart from what a machine sends wrong, each kind logged once."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log, self._kinds, self._latest = log, set[str](), PassingFault()
+
+    @property
+    def count(self) -> int:
+        """How many there were."""
+        return self._latest.count
+
+    def note(self, error: BaseException, doing: str, now: float) -> None:
+        """Count ``error``, raised at ``now`` (s) while ``doing`` something, like "decoding frame 0x181"."""
+        text = f"{doing}: {type(error).__name__}: {error}"
+        self._latest.note(f"a fault of this program in {text}", now)
+        places = traceback.extract_tb(error.__traceback__)
+        kind = f"{type(error).__name__} {places[-1].filename}:{places[-1].lineno}" if places else type(error).__name__
+        if kind not in self._kinds and len(self._kinds) < MAX_KINDS:
+            self._kinds.add(kind)
+            self._log.error("a fault of this program, of a kind that is logged once, in %s", text, exc_info=error)
+
+    def defect(self, now: float) -> str:
+        """Return for :attr:`otolith_drivers.base.Link.defect` what is recent at ``now`` (s); empty without."""
+        return "; ".join(self._latest.warnings(now))
 
 
 def cause_of(error: BaseException) -> str:

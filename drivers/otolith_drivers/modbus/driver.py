@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
-from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver
 from otolith_drivers.modbus.client import (
     BUSY_CODES,
     ConnectionLostError,
@@ -59,6 +59,8 @@ class ModbusPoller(ThreadedDriver):
         self._order = OrderMonitor(signals)
         self._unjudged: dict[str, list[Sample]] = {}  # By signal, until the first judgement of the byte order
         self._staleness = StalenessMonitor()
+        self._unusable = {signal.name: PassingFault() for signal in signals}  # Values that are no reading
+        self._own_faults = OwnFaults(log)
         self._received = self._bad = self._lost = 0
         self._rate_logged = False
         self._connection = Reconnection(options.title(), log)
@@ -77,7 +79,9 @@ class ModbusPoller(ThreadedDriver):
 
     def link(self) -> Link:
         schedule, requests, (up, reason) = self._schedule, self._requests.requests, self._connection.state
-        warnings = [*self._requests.warnings(time.monotonic()), *self._order.warnings()]
+        now = time.monotonic()
+        warnings = [*self._requests.warnings(now), *self._order.warnings()]
+        warnings += [line for name, fault in self._unusable.items() for line in fault.warnings(now, name)]
         warnings += self._staleness.warnings(requests, schedule.period)
         period = schedule.period if schedule.known or schedule.period > schedule.requested else None
         plan_text = f"{summary(requests)}, {schedule.describe()}"
@@ -85,7 +89,7 @@ class ModbusPoller(ThreadedDriver):
             plan_text += f", times right within {500.0 * max(trips):.2g} ms"
         if self._closings >= MAX_FAILURES:
             plan_text += ", reconnected for each request, as the device closes the connection after each answer"
-        return Link(up, reason, tuple(warnings), plan_text, period)
+        return Link(up, reason, tuple(warnings), plan_text, period, defect=self._own_faults.defect(now))
 
     def describe(self) -> list[str]:
         requests, period = self._requests.requests, self._schedule.requested
@@ -111,11 +115,11 @@ class ModbusPoller(ThreadedDriver):
                 self._wait()
                 if not self._stop.is_set():
                     connected = self._round(deliver)
-            except Exception as error:  # nothing that a device answers may end the thread
+            except Exception as error:  # noqa: BLE001 - nothing that a device answers may end the thread
                 if self._stop.is_set():  # the connection was closed by the driver
                     break
                 if not isinstance(error, ConnectionLostError):
-                    log.exception("%s", self._options.title())
+                    self._own_faults.note(error, f"a round of requests to {self._options.title()}", time.monotonic())
                 self._go_down(str(error) or type(error).__name__)
                 connected = False
                 self._stop.wait(self._connection.backoff.next())
@@ -218,7 +222,10 @@ class ModbusPoller(ThreadedDriver):
                 continue
             self._order.take(signal, part)
             decimals = 0.0 if signal.decimals is None else self._decimals.get(signal.decimals.place, math.nan)
-            samples.append(Sample(signal.name, moment, signal.value(part, decimals)))
+            value = signal.value(part, decimals)
+            if math.isnan(value):
+                self._unusable[signal.name].note(signal.why_no_value(part, decimals), moment)
+            samples.append(Sample(signal.name, moment, value))
         for sample in samples:
             if self._order.is_unjudged(sample.signal):
                 self._unjudged.setdefault(sample.signal, []).append(sample)

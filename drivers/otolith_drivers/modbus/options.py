@@ -207,6 +207,12 @@ class RegisterSignal:
             return math.nan
         return self.conversion.value(self.number(registers) / 10.0**decimals)
 
+    def why_no_value(self, registers: Sequence[int], decimals: float) -> str:
+        """Return why :meth:`value` is NaN, with value and range."""
+        if not 0.0 <= decimals <= MAX_DECIMALS:
+            return f"has {decimals:g} decimals, not 0 to {MAX_DECIMALS:g}"
+        return self.conversion.why_no_value(self.number(registers) / 10.0**decimals)
+
     def describe(self) -> str:
         """Return device, register, type, order and bit field in words."""
         order = f" {self.order}" if self.count > 1 else ""

@@ -20,7 +20,7 @@ from asyncua import Client, ua
 
 from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, Setup, Signal
 from otolith_drivers.common.message_times import ExchangeClock, PeriodEstimator, unix_time
-from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver
 from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
@@ -43,6 +43,7 @@ KEEPALIVE = 1  # intervals without a value, after which the server sends an empt
 QUEUE_MARGIN = 4  # messages that the server's queue of a variable can hold back
 HOLD_INTERVALS = 5.0  # messages without a change, after which a value is repeated at each message
 MAX_AGE = 5.0  # s between the stamp of a value and its message; more is another clock, or a time zone
+EXPECTED = (OSError, TimeoutError, asyncio.CancelledError, ua.UaError, RefusedError)  # What ends a session
 OVERFLOW = 0x480  # info bits of a status: of a data value, values before it were dropped (Part 4, 7.39.1)
 
 
@@ -172,9 +173,9 @@ def _why_unusable(status: ua.StatusCode, number: Any, node: NodeSignal) -> str:
         return f"status {status.name}"
     if not isinstance(number, bool | int | float):
         return f"a {type(number).__name__} instead of a number"
-    source, unit = node.source, node.source.unit or "the server's unit"
-    limits = f" (range {list(source.range)} {unit})" if source.range is not None else ""
-    return f"the number {number:.6g} is out of range or not finite{limits}"
+    if node.conversion is None:
+        return "a number of which the unit is not known"
+    return f"a number that {node.conversion.why_no_value(number)}"
 
 
 Options, Source = OpcuaOptions, OpcuaSource  # for base.DriverType
@@ -199,6 +200,7 @@ class OpcuaSubscriber(ThreadedDriver):
         super().__init__()
         self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
         self._connection = Reconnection(f"OPC UA {options.endpoint}", log)
+        self._own_faults = OwnFaults(log)
         self._latest = -math.inf  # s; time of the latest message
         self._slow = ""  # what the server grants less than was asked
         self._ended = ""  # why the subscription has ended
@@ -235,7 +237,8 @@ class OpcuaSubscriber(ThreadedDriver):
             plan = f"the server's clock is {abs(ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
             plan += f", {self._slow}" if self._slow else ""
-        return Link(up, reason, tuple(lines) if up else (), plan, latency=self._interval)
+        defect = self._own_faults.defect(now)
+        return Link(up, reason, tuple(lines) if up else (), plan, latency=self._interval, defect=defect)
 
     def describe(self) -> list[str]:
         nodes = [
@@ -253,6 +256,8 @@ class OpcuaSubscriber(ThreadedDriver):
             except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - nothing may end the thread
                 if self._stop.is_set():
                     return
+                if not isinstance(error, EXPECTED):
+                    self._own_faults.note(error, "a session with the server", time.monotonic())
                 self._connection.go_down(reason(error, self._options.timeout))
             try:
                 await asyncio.sleep(self._connection.backoff.next())
@@ -314,7 +319,7 @@ class OpcuaSubscriber(ThreadedDriver):
         )
         readings.begin(self._options.interval)
         self._latest, self._ended, self._slow = time.monotonic(), "", ""
-        result = await session.create_subscription(asked, lambda message: self._take(message, deliver))
+        result = await session.create_subscription(asked, lambda message: self._guarded_take(message, deliver))
         interval = self._interval = 1e-3 * float(result.RevisedPublishingInterval)
         readings.begin(interval)
         wanted = [index for index, node in enumerate(readings.signals) if not node.fault]
@@ -359,6 +364,12 @@ class OpcuaSubscriber(ThreadedDriver):
         return ua.MonitoredItemCreateRequest(
             ItemToMonitor=where, MonitoringMode=ua.MonitoringMode.Reporting, RequestedParameters=parameters
         )
+
+    def _guarded_take(self, result: ua.PublishResult, deliver: Deliver) -> None:
+        try:
+            self._take(result, deliver)
+        except Exception as error:  # noqa: BLE001 - the library would drop it without a word
+            self._own_faults.note(error, "reading a message of the server", time.monotonic())
 
     def _take(self, result: ua.PublishResult, deliver: Deliver) -> None:
         """Take a message of the subscription; called in the event loop."""

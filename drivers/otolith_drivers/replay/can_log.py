@@ -302,7 +302,8 @@ class CanLogReader(Reader):
             bad = self._decoder.counters.bad
             if bad > self._undecoded:
                 what = f"frame 0x{frame.arbitration_id:X} with data {bytes(frame.data).hex(' ') or 'of no length'}"
-                self._note(place, f"{what} is too short, or has a value out of its range")
+                if self._first_bad is None:
+                    self._note(place, f"{what}: {self._decoder.latest_rejection() or 'cannot be decoded'}")
             self._undecoded = bad
         if samples:
             self._latest = max(self._latest, time)
@@ -347,7 +348,8 @@ class CanLogReader(Reader):
             lines.append(f"frames of these messages come from channels {names}: are two machines mixed?")
         lines += [*self._cut_off(), *self._source.notes]
         # Frames that could not be used are already in the first line, with their place in the file.
-        return lines + (self._decoder.warnings(self._latest, unused=False) if self._frames else [])
+        lines += self._decoder.warnings(self._latest, unused=False) if self._frames else []
+        return [*lines, *filter(None, [self._decoder.defect(self._latest)])]
 
 
 class _FrameChunk:
@@ -383,6 +385,7 @@ class TextFormat:
 
     reader: type[Any]
     title: str
+    line: re.Pattern[str] | None = None  # How each line with a frame begins, if the reader does not check that
     prelude: str = ""  # A line that the reader skips when it is started again in the middle of the file
 
 
@@ -396,7 +399,9 @@ class _TrcReader(can.TRCReader):
 TEXT_FORMATS = {
     readers.ASC: TextFormat(can.ASCReader, readers.ASC, prelude="\n"),
     readers.TRC: TextFormat(_TrcReader, readers.TRC),
-    readers.CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
+    readers.CANDUMP_LOG: TextFormat(
+        can.CanutilsLogReader, "candump, as 'candump -L' writes it", readers.TEXT_LOGS[readers.CANDUMP_LOG]
+    ),
     readers.CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
     readers.SAVVYCAN: TextFormat(SavvyCanLines, readers.SAVVYCAN),
     readers.PYTHON_CAN: TextFormat(can.CSVReader, readers.PYTHON_CAN, prelude="\n"),
@@ -480,7 +485,11 @@ class TextFrames:
                     self._taken += 1
                     # Every writer ends its lines, so a last line without an end was cut.
                     cut = lines.is_last and not lines.line.endswith("\n")
-                    yield lines.number, self._quoted("is cut off") if cut else frame
+                    if cut or not self._is_whole(lines.line):
+                        what = "is cut off" if cut else f"is no frame of {self._kind.title}"
+                        yield lines.number, self._quoted(what)
+                    else:
+                        yield lines.number, frame
                 break
             except ConfigurationError:
                 raise
@@ -491,6 +500,9 @@ class TextFrames:
             if lines.is_last:
                 break
             lines.prelude = self._kind.prelude
+
+    def _is_whole(self, line: str) -> bool:
+        return self._kind.line is None or self._kind.line.match(line.strip()) is not None
 
     def _refuse_relative_times(self, reader: Any) -> None:
         """Only ASC may have time differences; python-can would take them for times."""

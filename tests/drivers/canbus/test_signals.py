@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from otolith_drivers.canbus.decoder import FrameDecoder
 from otolith_drivers.canbus.options import CanSource, FrameOptions
+from otolith_drivers.common.message_times import PeriodEstimator
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame, values
 from tests.messages import assert_each_says
@@ -189,6 +190,70 @@ def test_short_frames_are_bad_and_a_warning(tmp_path: Path) -> None:
     assert_each_says(frame_decoder.warnings(1.1), ("0x181", "3 bytes", "4", "2 ", "1.0 s"))
 
 
+TWO = dbc(
+    'BO_ 256 Drive: 8 Drive\n SG_ Current : 0|16@1- (0.01,0) [0|0] "A" Monitor\n'
+    ' SG_ Speed : 16|16@1- (0.1,0) [0|0] "rad/s" Monitor\n SG_ AliveCounter : 60|4@1+ (1,0) [0|15] "" Monitor'
+)
+BOTH = {"i": ("A", {"signal": "Current"}), "omega": ("rad/s", {"signal": "Speed"})}
+
+
+@pytest.mark.parametrize(
+    ("length", "expected", "bad"),
+    [(8, {"i": 1.0, "omega": 3.0}, 0), (4, {"i": 1.0, "omega": 3.0}, 0), (3, {"i": 1.0, "omega": None}, 1), (1, {}, 1)],
+)
+def test_of_a_short_frame_the_signals_that_are_in_it_are_read(
+    tmp_path: Path, length: int, expected: dict[str, float | None], bad: int
+) -> None:
+    frame_decoder = decoder(tmp_path, BOTH, TWO)
+    data = struct.pack("<hhI", 100, 30, 0)[:length]
+    read = values(frame_decoder.decode(frame(256, data), 0.0))
+    assert {name: None if math.isnan(value) else round(value, 9) for name, value in read.items()} == expected
+    assert (frame_decoder.counters.bad, frame_decoder.counters.lost) == (bad, 0)
+    warnings = frame_decoder.warnings(0.1)
+    assert any(f"{length} bytes instead of 8" in line for line in warnings) is (length < 8)
+    assert any("without omega" in line for line in warnings) is (length == 3)
+    assert not frame_decoder.defect(0.1)
+
+
+def test_a_short_frame_without_its_multiplexer_has_none_of_its_signals(tmp_path: Path) -> None:
+    text = dbc(
+        'BO_ 100 Values: 8 Drive\n SG_ Plain : 0|8@1+ (1,0) [0|0] "V" Monitor\n'
+        ' SG_ Kind M : 56|8@1+ (1,0) [0|0] "" Monitor\n SG_ Deep m1 : 8|8@1+ (1,0) [0|0] "V" Monitor'
+    )
+    frame_decoder = decoder(tmp_path, {"a": ("V", {"signal": "Plain"}), "b": ("V", {"signal": "Deep"})}, text)
+    assert values(frame_decoder.decode(frame(100, b"\x05\x06\x07"), 0.0)) == {"a": 5.0}
+    assert values(frame_decoder.decode(frame(100, b"\x05\x06" + bytes(5) + b"\x01"), 0.1)) == {"a": 5.0, "b": 6.0}
+
+
+def test_a_short_frame_without_its_checksum_is_refused(tmp_path: Path) -> None:
+    table = {"Drive": {"checksum": {"signal": {"start": 48, "length": 8}, "kind": "xor"}}}
+    frame_decoder = decoder(tmp_path, BOTH, TWO, messages=table)
+    assert frame_decoder.decode(frame(256, bytes(5)), 0.0) == []
+    assert frame_decoder.counters.bad == 1
+
+
+def test_a_value_out_of_its_range_names_signal_value_and_range(tmp_path: Path) -> None:
+    frame_decoder = decoder(tmp_path, {"V_a": ("V", {**RAW, "range": [0, 10]})})
+    frame_decoder.decode(frame(0x181, struct.pack("<h", 2345) + bytes(6)), 0.0)
+    assert_each_says(frame_decoder.warnings(0.1), ("V_a", "23.45 V", "0 to 10 V"))
+    assert "23.45 V" in frame_decoder.latest_rejection()
+
+
+def test_a_fault_of_the_decoder_is_counted_apart_and_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    frame_decoder = decoder(tmp_path, BOTH, TWO)
+    assert not frame_decoder.defect(0.0)
+    monkeypatch.setattr(PeriodEstimator, "lost_before", lambda *_: 1 // 0)
+    for index in range(5):
+        assert frame_decoder.decode(frame(256, bytes(8)), 0.1 * index) == []
+    assert frame_decoder.counters.bad == 5
+    assert_each_says([frame_decoder.defect(1.0)], ("ZeroDivisionError", "0x100", "5 in all"))
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    assert caplog.records[0].exc_info is not None
+    assert not frame_decoder.defect(100.0)
+
+
 def test_fd_frames_have_more_than_eight_bytes(tmp_path: Path) -> None:
     wishes = {"V_a": ("V", {**RAW, "start": 496, "fd": True})}
     frame_decoder = decoder(tmp_path, wishes)
@@ -246,6 +311,7 @@ def test_hostile_frames_neither_raise_nor_give_wrong_values(
     assert after.bad - before.bad >= unusable
     assert all(abs(sample.value) < 1e301 for sample in got if math.isfinite(sample.value))
     assert all("\n" not in line for line in frame_decoder.warnings(time))
+    assert not frame_decoder.defect(time)
 
 
 def test_options_take_one_database_or_several() -> None:

@@ -111,7 +111,7 @@ QUIRKS = {
     "late": Quirk(lambda: Behaviour(WORDS, corrupt=now_and_then(late)), 0.5),
     "duplicate": Quirk(lambda: Behaviour(WORDS, corrupt=now_and_then(lambda reply: 2 * reply)), 0.05),
     "torn 32-bit": Quirk(
-        lambda: Behaviour(WORDS, corrupt=now_and_then(torn)), 0.05,
+        lambda: Behaviour(WORDS, corrupt=now_and_then(torn)), 0.05, "s1: is .* out of its range from -100 to 100",
         sources=[source(register=0), source(register=2, range=[-100, 100])],
     ),
     "word order": Quirk(lambda: Behaviour(WORDS, corrupt=swapped), 0.6, 'set order = "CDAB"'),
