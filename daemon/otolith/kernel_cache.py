@@ -9,12 +9,13 @@ import ctypes
 import fcntl
 import hashlib
 import importlib.util
+import logging
 import mmap
 import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -22,9 +23,12 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from otolith_drivers.errors import ServiceError
-from otolith_drivers.user_dirs import cache_directory
+from otolith_drivers.user_dirs import cache_directory, spare_cache_directory
+
+log = logging.getLogger(__name__)
 
 MAX_BYTES = 200_000_000  # of the cache: the least recently used kernels beyond are removed
+MIN_FREE_BYTES = 32 << 20  # of the disk of the cache, below which kernels are kept in another folder
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
@@ -41,10 +45,12 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
     name = f"otolith_kernel_{key}"
     if name in sys.modules:
         return sys.modules[name]
-    store = cache_directory("kernels")
+    store, earlier = _store()
     folder = store / key
     with _locked(store / f"{key}.lock"):
         file = folder / f"{name}.py"
+        if earlier is not None and not file.exists() and (earlier / key).is_dir():
+            shutil.copytree(earlier / key, folder, dirs_exist_ok=True)  # with the times by which Numba knows its code
         if not file.exists():
             folder.mkdir(mode=0o700, exist_ok=True)
             _write(file, make_source())
@@ -52,6 +58,25 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
             _remove_old(store, keep=folder)
         os.utime(folder)
         return _import(name, file)
+
+
+def _store() -> tuple[Path, Path | None]:
+    """Return the folder of the kernels, and one from which they are copied: a disk that cannot be written."""
+    try:
+        store = cache_directory("kernels")
+        if shutil.disk_usage(store).free >= MIN_FREE_BYTES:
+            return store, None
+        reason = f"{store}: its disk has less than {MIN_FREE_BYTES >> 20} MB free"
+    except ServiceError as error:
+        reason = str(error)
+    store, earlier = spare_cache_directory("kernels")
+    _warn(f"{reason}; until that is mended, kernels are kept in {store}")
+    return store, earlier
+
+
+@cache
+def _warn(text: str) -> None:
+    log.warning("%s", text)
 
 
 @cache
@@ -105,10 +130,18 @@ def discard(module: ModuleType) -> None:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("w", encoding="utf-8") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+def _locked(path: Path, wait: int = 0) -> Iterator[None]:
+    """Hold the lock of a kernel; raise BlockingIOError if another has it and ``wait`` is ``LOCK_NB``.
+
+    Its holder may remove the file. Who waited for it takes the lock of the new one, which others use by then.
+    """
+    while True:
+        with path.open("w", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | wait)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                    yield
+                    return
 
 
 def _write(file: Path, text: str) -> None:
@@ -137,8 +170,10 @@ def _remove_old(store: Path, keep: Path) -> None:
     for folder in reversed(folders):
         size += sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         if size > MAX_BYTES and folder != keep:
-            shutil.rmtree(folder, ignore_errors=True)
-            (store / f"{folder.name}.lock").unlink(missing_ok=True)
+            lock = store / f"{folder.name}.lock"
+            with suppress(BlockingIOError), _locked(lock, fcntl.LOCK_NB):  # another process loads or compiles it
+                shutil.rmtree(folder, ignore_errors=True)
+                lock.unlink(missing_ok=True)
 
 
 def release_compiler() -> None:

@@ -2,10 +2,12 @@
 
 import contextlib
 import os
+import tempfile
 from pathlib import Path
 
 from otolith_drivers.errors import ServiceError
 
+EXECUTED = "its content is executed"
 SERVICES = Path("/run/otolith")  # The folder of systemd's RuntimeDirectory=otolith/%i: one folder for each service
 
 
@@ -43,8 +45,26 @@ def cache_directory(name: str) -> Path:
     Raises:
         ServiceError: the folder cannot be created, belongs to another user, or is writable by others.
     """
-    folder = writable(_user_directory("CACHE_DIRECTORY", "XDG_CACHE_HOME", ".cache") / name)
-    return _guarded(folder, "its content is executed")
+    return _guarded(writable(_cache(name)), EXECUTED)
+
+
+def spare_cache_directory(name: str) -> tuple[Path, Path | None]:
+    """Return a folder for the same data where the cache cannot be written, and the cache itself if it can be read.
+
+    Raises:
+        ServiceError: the cache, or the other folder, belongs to another user or is writable by others.
+    """
+    cache = _cache(name)
+    readable = _guarded(cache, EXECUTED) if cache.is_dir() else None
+    try:
+        folder = runtime_directory() / name
+    except ServiceError:
+        folder = _guarded(writable(Path(tempfile.gettempdir()) / f"otolith-{os.geteuid()}"), EXECUTED) / name
+    return _guarded(writable(folder), EXECUTED), readable
+
+
+def _cache(name: str) -> Path:
+    return _user_directory("CACHE_DIRECTORY", "XDG_CACHE_HOME", ".cache") / name
 
 
 def _guarded(folder: Path, reason: str) -> Path:

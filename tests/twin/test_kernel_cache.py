@@ -2,8 +2,11 @@
 
 import dataclasses
 import errno
+import os
+import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -152,3 +155,67 @@ def test_the_compiler_returns_its_memory_and_goes_on_compiling(library: str) -> 
     before, after = map(int, done.stdout.split())
     assert before > 10_000  # kB
     assert after < 0.1 * before
+
+
+def test_a_kernel_that_another_process_has_locked_is_not_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel_cache.load("old", lambda: "#" * 10_000)
+    (old,) = cache.glob("*.lock")
+    monkeypatch.setattr(kernel_cache, "MAX_BYTES", 5_000)
+    with kernel_cache._locked(old):
+        kernel_cache.load("new", lambda: "#" * 10_000)
+        assert old.exists()
+        assert old.with_suffix("").is_dir()
+    kernel_cache.load("newer", lambda: "#" * 10_000)
+    assert not old.exists()
+    assert not old.with_suffix("").exists()
+
+
+def test_a_lock_is_held_by_one_although_its_file_is_removed(tmp_path: Path) -> None:
+    lock, inside, most = tmp_path / "lock", list[int](), list[int]()
+
+    def take(number: int) -> None:
+        for _ in range(20):
+            with kernel_cache._locked(lock):
+                inside.append(number)
+                most.append(len(inside))
+                time.sleep(0.001)
+                inside.remove(number)
+                lock.unlink()
+
+    threads = [threading.Thread(target=take, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert len(most) == 80
+    assert max(most) == 1
+
+
+@pytest.mark.parametrize("disk", ["read-only", "full"])
+def test_a_cache_that_cannot_be_written_is_read(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, disk: str
+) -> None:
+    """The answers of the operating system are replaced: a disk that is read-only does not stop root."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    first = kernel_cache.load(f"kept {disk}", lambda: "number = 1")
+    (source,) = cache.glob("*/*.py")
+    monkeypatch.delitem(sys.modules, first.__name__)
+    before = sorted(cache.rglob("*"))
+    if disk == "full":
+        usage = shutil.disk_usage(tmp_path)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1 << 20))
+    else:
+        access = os.access
+        monkeypatch.setattr(
+            os, "access", lambda path, mode: not Path(path).is_relative_to(cache) and access(path, mode)
+        )
+    again = kernel_cache.load(f"kept {disk}", lambda: "number = 2")
+    other = kernel_cache.load(f"made {disk}", lambda: "number = 3")
+    assert (again.number, other.number) == (1, 3)
+    (copy,) = (tmp_path / "run" / "kernels").glob(f"{source.parent.name}/*.py")
+    assert copy.stat().st_mtime_ns == source.stat().st_mtime_ns
+    assert sorted(cache.rglob("*")) == before
+    assert caplog.text.count("kernels are kept in") == 1
+    cache.chmod(0o777)
+    with pytest.raises(ServiceError, match="writable by no other"):
+        kernel_cache.load(f"untrusted {disk}", lambda: "number = 4")
