@@ -24,6 +24,7 @@ from asyncua.crypto.validator import CertificateValidator, CertificateValidatorO
 from tests.conftest import free_port
 
 PERIOD = 0.01  # s
+MOTOR = "urn:motor"  # URI of the namespace of the variables
 
 
 class OneUser:
@@ -53,9 +54,13 @@ async def serve(options: argparse.Namespace) -> None:
                 CertificateValidatorOptions.TRUSTED_VALIDATION | CertificateValidatorOptions.PEER_CLIENT, trusted
             )
         )
-    space = await server.register_namespace("urn:motor")
-    assert space == 2
-    values: dict[str, Any] = json.loads(options.values)
+    for uri in options.namespaces.split(","):  # those beside the motor's have variables of the same names, always 0
+        space = await server.register_namespace(uri)
+        for name in json.loads(options.values) if uri != MOTOR else ():
+            await server.nodes.objects.add_variable(ua.NodeId(name, space), ua.QualifiedName(name, space), 0.0)
+    is_there = MOTOR in options.namespaces
+    space = await server.get_namespace_index(MOTOR) if is_there else 0
+    values: dict[str, Any] = json.loads(options.values) if is_there else {}
     nodes = {}
     for name, (value, unit) in values.items():
         node = nodes[name] = await server.nodes.objects.add_variable(ua.NodeId(name, space), name, float(value))
@@ -78,7 +83,7 @@ async def serve(options: argparse.Namespace) -> None:
 
 @contextmanager
 def opcua_server(port: int, values: dict[str, tuple[float, str]], *arguments: str) -> "Iterator[subprocess.Popen[str]]":
-    """The process of a server with the variables ``ns=2;s=NAME``: value and unit by name."""
+    """The process of a server with the variables ``nsu=urn:motor;s=NAME``: value and unit by name."""
     command = [sys.executable, "-m", "tests.drivers.opcua_server", "--port", str(port), "--values", json.dumps(values)]
     with subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -103,6 +108,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--port", type=int)
     parser.add_argument("--values")
+    parser.add_argument("--namespaces", default=MOTOR)
     parser.add_argument("--user", action="store_true")
     for name in ("--certificate", "--key", "--trusted"):
         parser.add_argument(name)

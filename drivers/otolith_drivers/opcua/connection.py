@@ -4,13 +4,13 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
@@ -75,7 +75,7 @@ class OpcuaOptions(CredentialOptions):
 
 
 class OpcuaSource(ScaledSource):
-    """Variable of a signal: ``{ node = "ns=2;s=Motor.Speed" }``; its unit is that of the server unless it is given."""
+    """Variable of a signal: ``{ node = "nsu=urn:maker;s=Speed" }``; its unit is the server's unless it is given."""
 
     node: Annotated[str, Field(min_length=1)]
 
@@ -84,7 +84,7 @@ class OpcuaSource(ScaledSource):
         try:
             ua.NodeId.from_string(self.node)
         except ua.UaError:
-            example = '"ns=2;s=Motor.Speed", "ns=3;i=1001" or "nsu=urn:maker;s=Motor.Speed"'
+            example = '"nsu=urn:maker;s=Motor.Speed", "ns=2;s=Motor.Speed" or "ns=3;i=1001"'
             raise ValueError(f"{self.node!r} is no node id: write {example}") from None
         return self
 
@@ -238,15 +238,62 @@ async def exchange(client: Client, clock: ExchangeClock) -> None:
     clock.exchange(sent, unix_time(response.ResponseHeader.Timestamp), received)
 
 
-async def node_id(client: Client, text: str) -> ua.NodeId:
-    """Return the node that ``text`` names; raise ValueError if the server lacks the URI of its namespace."""
+async def namespaces(client: Client) -> list[str]:
+    """Return the URIs of the server's namespaces, in their order of this session; empty if it does not tell them."""
+    try:
+        return list(map(str, await client.get_namespace_array()))
+    except (ua.UaStatusCodeError, TypeError):
+        return []
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedNode:
+    """A node of a machine file, as it is in a session."""
+
+    node: ua.NodeId
+    namespace: str  # URI; empty if it is not known
+    moved: str = ""  # What has changed if the number of its namespace is another than in the file
+
+
+def place(text: str, spaces: Sequence[str], namespace: str) -> PlacedNode:
+    """Return the node that ``text`` names on a server with the namespaces ``spaces``.
+
+    The number of a namespace may be another after each restart of the server; its URI is not. So a number means the
+    namespace that it had at the first connection: ``namespace``, which is empty then.
+
+    Raises:
+        ValueError: the server lacks that namespace.
+    """
     node = ua.NodeId.from_string(text)
-    if (uri := getattr(node, "NamespaceUri", None)) is None:
-        return node
-    spaces = await client.get_namespace_array()
-    if uri not in spaces:
-        raise ValueError(f"the server has no namespace {uri!r}: {nearest(uri, spaces)}")
-    return ua.NodeId(node.Identifier, spaces.index(uri), node.NodeIdType)
+    written = node.NamespaceIndex
+    if (uri := getattr(node, "NamespaceUri", None)) is not None:
+        known = next((name for name in (uri, unquote(uri)) if name in spaces), None)
+        if known is None:
+            raise ValueError(f"the server has no namespace {uri!r}: {nearest(uri, list(spaces))}")
+        return PlacedNode(_with_index(node, spaces.index(known)), known)
+    now = spaces[written] if written < len(spaces) else ""
+    if not written or now == namespace or not namespace:
+        return PlacedNode(node, now or namespace)
+    if namespace not in spaces:
+        was = f"at the first connection ns={written} was the namespace {namespace!r}, which the server lacks now"
+        raise ValueError(f"{was}: restart Otolith if {now!r} is meant" if now else was)
+    index = spaces.index(namespace)
+    renumbered = f"the server has renumbered its namespaces: {namespace!r} was ns={written} and is ns={index} now"
+    moved = f"{renumbered}, where its nodes are read: write nsu={namespace} instead of ns={written}"
+    return PlacedNode(_with_index(node, index), namespace, moved)
+
+
+def _with_index(node: ua.NodeId, index: int) -> ua.NodeId:
+    return ua.NodeId(node.Identifier, index, node.NodeIdType)
+
+
+def lasting_name(node: ua.NodeId, spaces: Sequence[str]) -> str:
+    """Return the name of a node for a machine file, with the URI of its namespace instead of its number."""
+    number, name = node.NamespaceIndex, str(node.to_string())
+    if not 0 < number < len(spaces) or spaces.count(spaces[number]) > 1:
+        return name
+    uri = spaces[number].replace("%", "%25").replace(";", "%3B")
+    return f"nsu={uri};{_with_index(node, 0).to_string()}"
 
 
 async def unit_of(client: Client, node: ua.NodeId) -> str:
@@ -263,7 +310,7 @@ async def unit_of(client: Client, node: ua.NodeId) -> str:
 class Variable:
     """A variable of a server."""
 
-    node: str
+    node: str  # With the URI of its namespace
     path: str  # Names from the folder of objects down to it
     value: Any  # The present value; None if it has none
     type: str
@@ -275,6 +322,7 @@ async def browse(client: Client, most: int) -> list[Variable]:
     """Return the variables below the folder of objects, except those of OPC UA itself, ``most`` at most."""
     waiting: deque[tuple[ua.NodeId, str]] = deque([(client.nodes.objects.nodeid, "")])
     seen, variables = set[str](), list[Variable]()
+    spaces = await namespaces(client)
     while waiting and len(variables) < most:
         parent, path = waiting.popleft()
         for child in await client.get_node(parent).get_children_descriptions(includesubtypes=True):
@@ -285,15 +333,15 @@ async def browse(client: Client, most: int) -> list[Variable]:
             name = f"{path}/{child.BrowseName.Name}".lstrip("/")
             if child.NodeClass == ua.NodeClass.Variable:
                 is_property = child.ReferenceTypeId == ua.NodeId(ua.ObjectIds.HasProperty)
-                variables += [] if is_property else [await _variable(client, node, name)]
+                variables += [] if is_property else [await _variable(client, node, name, spaces)]
             if child.NodeClass in {ua.NodeClass.Object, ua.NodeClass.Variable}:
                 waiting.append((node, name))
     return variables[:most]
 
 
-async def _variable(client: Client, node: ua.NodeId, path: str) -> Variable:
+async def _variable(client: Client, node: ua.NodeId, path: str, spaces: Sequence[str]) -> Variable:
     read = await client.get_node(node).read_data_value(raise_on_bad_status=False)
     variant, status = read.Value, read.StatusCode or ua.StatusCode()
     kind = variant.VariantType.name if variant is not None and variant.VariantType is not None else ""
     value = None if variant is None else variant.Value
-    return Variable(node.to_string(), path, value, kind, await unit_of(client, node), status.name)
+    return Variable(lasting_name(node, spaces), path, value, kind, await unit_of(client, node), status.name)

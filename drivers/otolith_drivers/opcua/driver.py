@@ -29,7 +29,8 @@ from otolith_drivers.opcua.connection import (
     RefusedError,
     connected,
     exchange,
-    node_id,
+    namespaces,
+    place,
     reason,
     unit_of,
 )
@@ -54,6 +55,8 @@ class NodeSignal:
     signal: Signal
     conversion: Conversion | None = None  # None until the unit is known
     node: Any = None  # Its variable on the server, a ua.NodeId; None until it is looked up
+    namespace: str = ""  # URI of its namespace at the first connection
+    defect: str = ""  # How its namespace has changed since then
     fault: str = ""  # Why the server does not send it; empty if it does
     value: float = math.nan  # The latest value in the unit of the twin
     time: float = -math.inf  # Of the latest sample, s
@@ -237,7 +240,8 @@ class OpcuaSubscriber(ThreadedDriver):
             plan = f"the server's clock is {abs(ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
             plan += f", {self._slow}" if self._slow else ""
-        defect = self._own_faults.defect(now)
+        changed = dict.fromkeys(node.defect for node in readings.signals)
+        defect = "; ".join(filter(None, [*changed, self._own_faults.defect(now)]))
         return Link(up, reason, tuple(lines) if up else (), plan, latency=self._interval, defect=defect)
 
     def describe(self) -> list[str]:
@@ -293,13 +297,15 @@ class OpcuaSubscriber(ThreadedDriver):
 
     async def _look_up(self, client: Client) -> None:
         """Ask for the variables, and for the units that the machine file leaves out."""
+        spaces = await namespaces(client)
         for node in self._readings.signals:
             node.fault = ""
             try:
-                node.node = await node_id(client, node.source.node)
+                placed = place(node.source.node, spaces, node.namespace)
             except ValueError as error:
-                node.fault = f"{node.source.node}: {error}"
+                node.fault, node.defect = f"{node.source.node}: {error}", str(error) if node.namespace else ""
                 continue
+            node.node, node.namespace, node.defect = placed.node, placed.namespace, placed.moved
             if node.source.unit is not None:
                 continue
             try:

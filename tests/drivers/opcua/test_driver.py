@@ -22,11 +22,11 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.common import reconnection
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.opcua import driver as opcua
-from otolith_drivers.opcua.connection import certificate_warnings
+from otolith_drivers.opcua.connection import certificate_warnings, lasting_name, place
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
 from tests.drivers.opcua_server import opcua_server, server_of_this_process
-from tests.messages import raises_saying
+from tests.messages import assert_each_says, raises_saying
 from tests.waiting import wait_for
 
 VALUES = {"i": (2.0, "A"), "omega": (10.0, "rad/s")}
@@ -131,6 +131,48 @@ def test_a_namespace_that_the_server_lacks_costs_only_its_signal(port: int, tmp_
         (warning,) = driver.link().warnings
         assert "'urn:moter': did you mean 'urn:motor'?" in warning
         assert {sample.signal for sample in samples} == {"i"}
+
+
+@pytest.mark.parametrize(("before", "after"), [("urn:motor,urn:pump", "urn:pump,urn:motor")])
+def test_a_server_that_renumbers_its_namespaces_is_not_read_as_if_nothing_had_happened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str
+) -> None:
+    monkeypatch.setattr(reconnection, "BACKOFF_MAX", 0.3)
+    port, nodes = free_port(socket.SOCK_STREAM), {"i": "ns=2;s=i", "omega": "nsu=urn:motor;s=omega"}
+    with opened(port, tmp_path, nodes=nodes) as (driver, samples):
+        with opcua_server(port, VALUES, "--namespaces", before):
+            wait_for(lambda: len(samples) > 20)
+            assert not driver.link().defect
+        wait_for(lambda: not driver.link().up)
+        with opcua_server(port, VALUES, "--namespaces", after):
+            wait_for(lambda: driver.link().up)
+            assert_each_says([driver.link().defect], ("'urn:motor'", "ns=2", "ns=3", "write nsu=urn:motor"))
+            count = len(samples)
+            wait_for(lambda: {sample.signal for sample in samples[count:]} == {"i", "omega"})
+        wait_for(lambda: not driver.link().up)
+        with opcua_server(port, VALUES, "--namespaces", "urn:pump"):
+            wait_for(lambda: "'urn:motor'" in driver.link().reason)
+            assert "lacks" in driver.link().defect
+    assert {(sample.signal, sample.value) for sample in samples} == {("i", 2.0), ("omega", 10.0)}
+
+
+SPACES = ["http://opcfoundation.org/UA/", "urn:server", "urn:a;b%", "urn:motor"]
+
+
+@pytest.mark.parametrize("name", ["nsu=urn:motor;s=a;b=1", "nsu=urn:server;i=7", "nsu=urn:a%3Bb%25;s=x", "i=2267"])
+def test_a_lasting_name_is_read_as_the_node_that_it_names(name: str) -> None:
+    placed = place(name, SPACES, "")
+    assert lasting_name(placed.node, SPACES) == name
+    assert place(name, SPACES[::-1], placed.namespace).namespace == placed.namespace or not placed.node.NamespaceIndex
+    assert not placed.moved
+
+
+def test_without_the_uris_of_its_namespaces_a_server_is_read_by_their_numbers() -> None:
+    assert place("ns=2;s=i", [], "").node.NamespaceIndex == 2
+    assert lasting_name(place("ns=2;s=i", [], "").node, []) == "ns=2;s=i"
+    assert lasting_name(place("ns=1;s=i", ["a", "b", "b"], "").node, ["a", "b", "b"]) == "ns=1;s=i"
+    with pytest.raises(ValueError, match="urn:motor"):
+        place("ns=2;s=i", [], "urn:motor")
 
 
 def test_a_server_of_another_kind_and_none_are_named(tmp_path: Path) -> None:
@@ -257,17 +299,18 @@ def test_options_that_do_not_fit_are_refused(keys: dict[str, object]) -> None:
 def test_probe_lists_the_variables_with_value_type_and_unit(port: int) -> None:
     command = ["probe", "opcua", f"opc.tcp://127.0.0.1:{port}/motor"]
     result = CliRunner().invoke(cli, command, standalone_mode=False, catch_exceptions=False)
-    assert 'i = { node = "ns=2;s=i" }  # i: 2.0 A, Double' in result.output
+    assert 'i = { node = "nsu=urn:motor;s=i" }  # i: 2.0 A, Double' in result.output
     assert (
-        'bad = { node = "ns=2;s=bad" }  # bad: None A, Double' in result.output or "BadSensorFailure" in result.output
+        'bad = { node = "nsu=urn:motor;s=bad" }  # bad: None A, Double' in result.output
+        or "BadSensorFailure" in result.output
     )
-    assert 'omega = { node = "ns=2;s=omega", unit = "?" }  # omega: 10.0, Double' in result.output
+    assert 'omega = { node = "nsu=urn:motor;s=omega", unit = "?" }  # omega: 10.0, Double' in result.output
     some = CliRunner().invoke(cli, [*command, "--most", "2"], standalone_mode=False).output
     assert "2 variables, as many as --most allows" in some
     document = json.loads(CliRunner().invoke(cli, [*command, "--json"], standalone_mode=False).output)
     assert [(one["node"], one["unit"]) for one in document["variables"]][:2] == [
-        ("ns=2;s=i", "A"),
-        ("ns=2;s=omega", ""),
+        ("nsu=urn:motor;s=i", "A"),
+        ("nsu=urn:motor;s=omega", ""),
     ]
 
 
