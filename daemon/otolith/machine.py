@@ -190,7 +190,8 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     driver = None
     if with_driver and (file.drivers or file.read_signals or not for_replay):
         driver = build_driver(driver_configs(file, twin, source))
-    plan = _plan(file, twin, problem, context)
+    varying = frozenset(item.name for item in unmeasured if item.assumption is Assumption.CONSTANT)
+    plan = replace(_plan(file, twin, problem, context), varying=varying)
     return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured)
 
 

@@ -262,6 +262,7 @@ def test_an_unmeasured_input_is_configured_like_any_parameter(tmp_path: Path) ->
     (free,) = (row for row in machine.problem.free if row.name == "T_load")
     assert (free.nominal, free.low) == (0.02, 0.0)
     assert machine.plan.parameters["T_load"].limits[0].value == pytest.approx(0.03)
+    assert machine.plan.varying == {"T_load"}
     path.write_text(f'{head}"slow" }}\n', encoding="utf-8")
     assert load_machine(path, for_replay=True).problem.process_noise == pytest.approx((0.0, 0.0, 0.004))
     path.write_text(f'{head}"slow" }}\n[process_noise]\nT_load = "1 mN*m/s^0.5"\n', encoding="utf-8")

@@ -101,6 +101,7 @@ class MonitoringPlan:
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
     signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings
+    varying: frozenset[str] = frozenset()  # Parameters whose sudden changes are ordinary, as of an unknown load
 
     @property
     def texts(self) -> Texts:

@@ -130,7 +130,7 @@ class HealthState:
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""
     report = _translated(plan, report)
-    state = _with_forecasts(plan, _with_steps(state, report), report)
+    state = _with_forecasts(plan, _with_steps(plan, state, report), report)
     parameters = {
         name: item.model_copy(update={"forecast": state.forecasts.get(name), **_judged(plan, report, name)})
         for name, item in report.parameters.items()
@@ -230,10 +230,11 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
     return report.model_copy(update=changed)
 
 
-def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
+def _with_steps(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of a window that updated them, and with their sudden changes.
 
-    The history of a parameter begins again at a sudden change.
+    The history of a parameter begins again at a sudden change. Where what changed most varies in ordinary operation,
+    the windows before, which contradicted what was known, are no doubt.
     """
     if report.decision not in ACCEPTED:
         return state
@@ -244,7 +245,17 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
     moved = {name for name, change in changes.items() if abs(change) > QUANTILE * (report.parameters[name].sd or 0.0)}
     for name in moved:
         state = state.without_history(name)
+    if moved and max(moved, key=lambda name: abs(changes[name]) / (report.parameters[name].sd or 1.0)) in plan.varying:
+        state = replace(state, doubtful=_before_the_last_run(state.doubtful, report.window.index))
     return replace(state, values=values, steps={**state.steps, **{name: changes[name] for name in moved}})
+
+
+def _before_the_last_run(doubtful: tuple[int, ...], now: int) -> tuple[int, ...]:
+    """Return the indices before those that lead without a gap to the window before ``now``."""
+    rest = list(doubtful)
+    while rest and rest[-1] == now - 1 - (len(doubtful) - len(rest)):
+        rest.pop()
+    return tuple(rest)
 
 
 def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
