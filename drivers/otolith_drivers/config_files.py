@@ -262,7 +262,7 @@ def line_of(text: str, location: Location) -> int | None:
                     header.append(tables_seen[place])
             path = header
         elif assignment := ASSIGNMENT.match(line):
-            path = [*header, *(part.strip().strip("\"'") for part in KEY_PART.findall(assignment[1]))]
+            path = [*header, *(part.strip().strip("\"'") for part in KEY_PART.findall(assignment[1].strip()))]
         else:
             continue
         if len(path) > depth and list(location[: len(path)]) == path:
