@@ -23,6 +23,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, ScaledSource, Setup, Signal
+from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.message_times import ArrivalClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver, cause_of
@@ -311,7 +312,7 @@ class MqttListener(ThreadedDriver):
         if messages.retained:
             facts.append(f"{counted(messages.retained, 'retained message')} not used")
         if offsets := messages.offsets():
-            wall = time.time() - now
+            wall = wall_clock_offset()
             ends = [f"{-wall - offset:+.4g} s" for offset in {min(offsets), max(offsets)}]
             facts.append(f"the senders' clocks minus this computer's: {' to '.join(sorted(ends))}, less the way here")
         defect = self._own_faults.defect(now)

@@ -42,7 +42,7 @@ def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -
         feed(rings, arrived)
         if windower.begin(rings, now, now):
             while windower.due(rings, now):
-                windows.append(windower.cut(rings, unix_offset=1000.0))
+                windows.append(windower.cut(rings, offset=1000.0))
         now += 0.004
     return windows
 
@@ -139,7 +139,7 @@ def test_the_gap_limit_returns_with_the_fine_grid() -> None:
     windower.regrid(RECORDS, PERIOD)
     feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])
     assert windower.begin(rings, 1.0, 1.0)
-    reasons = windower.cut(rings, unix_offset=0.0).quality.reasons
+    reasons = windower.cut(rings, offset=0.0).quality.reasons
     assert "b has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons or (
         "a has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons
     )
@@ -192,7 +192,7 @@ def test_a_window_waits_for_a_delayed_signal() -> None:
     for now in np.arange(0.0, 4.0, 0.005):
         rings.deliver([Sample("a", now, now), Sample("b", now, now - delay)] if round(now / 0.005) % 2 == 0 else [])
         while windower.begin(rings, now, now) and windower.due(rings, now):
-            windows.append(windower.cut(rings, unix_offset=0.0))
+            windows.append(windower.cut(rings, offset=0.0))
     assert len(windows) >= 6
     for window in windows:
         assert not window.missing.any()
@@ -206,7 +206,7 @@ def test_a_window_waits_for_its_last_true_samples() -> None:
     for now in times:
         rings.deliver([Sample("a", now, now)])
         while windower.begin(rings, now, now) and windower.due(rings, now):
-            windows.append(windower.cut(rings, unix_offset=0.0))
+            windows.append(windower.cut(rings, offset=0.0))
     values = np.concatenate([window.column("a")[~window.missing_in("a")] for window in windows])
     assert values == pytest.approx(times[: len(values)])
     assert len(windows) >= 6
@@ -218,7 +218,7 @@ def test_samples_of_later_windows_that_are_overwritten_are_counted() -> None:
     windower = Windower(plans("a"), RECORDS, PERIOD)
     rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60)])
     assert windower.begin(rings, 0.6, 0.6)
-    windower.cut(rings, unix_offset=0.0)
+    windower.cut(rings, offset=0.0)
     rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60, 170)])
     assert rings.counters().overwritten == 170 - 100 - RECORDS
 
@@ -234,6 +234,6 @@ def test_the_grace_period_covers_the_next_sample_of_a_slow_input(interval: float
     )
     assert windower.begin(rings, 20.0, 20.0)
     for _ in range(4):
-        windower.cut(rings, unix_offset=0.0)
+        windower.cut(rings, offset=0.0)
     expected = min(max(1.5 * interval, GRACE_PERIOD), RECORDS * PERIOD)
     assert windower.grace == pytest.approx(expected if interval < 3.0 * RECORDS * PERIOD else GRACE_PERIOD)

@@ -243,7 +243,7 @@ def test_reset_records_what_to_forget_and_keeps_decisions() -> None:
     )
     assert store().decisions().resets.keys() == {"R_a", KEY, "*"}
     machine = load_machine(MACHINE, with_driver=False)
-    warm, note = store().restore(initial_state("m", "s", machine.problem), 0.0)
+    warm, note = store().restore(initial_state("m", "s", machine.problem))
     assert note == ""
     assert [component.key for component in warm.problem.components] == [KEY]
     assert apply_decisions(warm, store().decisions()).problem.components == ()

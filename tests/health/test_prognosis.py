@@ -19,7 +19,7 @@ from otolith.health.prognosis import (
     span,
     with_point,
 )
-from otolith.health.schema import CrossingDocument, ReportDocument
+from otolith.health.schema import CrossingDocument
 from otolith.health.text import crossing_text, duration_text, event_text
 from tests.health.test_events import PLAN, changes, report
 
@@ -167,31 +167,6 @@ def test_a_clock_that_is_set_keeps_a_history_usable() -> None:
     assert is_plausible(back)
     assert not is_plausible(((2.0, 1.0, 1.0), (1.0, 1.0, 1.0)))
     assert not is_plausible(((2.0, 1.0, 0.0),))
-
-
-def shifted(document: ReportDocument, seconds: float) -> ReportDocument:
-    times = {"start": document.window.start + seconds, "end": document.window.end + seconds}
-    return document.model_copy(update={"window": document.window.model_copy(update=times)})
-
-
-def test_a_clock_that_was_behind_for_a_while_costs_no_history() -> None:
-    """A computer without a battery begins long ago, until the network sets its clock."""
-    state, year = HealthState(), 365 * 86_400.0
-    for index in range(40):
-        state, _ = assess(PLAN, state, report(index, 6.5))
-    before = state.histories["R_a"]
-    for index in range(40, 50):
-        state, _ = assess(PLAN, state, shifted(report(index, 6.5), -year))
-    assert len(state.histories["R_a"]) == 10
-    later, _ = assess(PLAN, state, report(50, 6.5))
-    assert later.histories["R_a"][:-1] == before
-    assert later.earlier == {}
-    for index in (50, 50 + 50_000):  # the clock was ahead before, or stays behind
-        state, _ = assess(PLAN, state, shifted(report(index, 6.5), -year))
-    assert state.earlier == {}
-    assert len(state.histories["R_a"]) == 12
-    state, _ = assess(PLAN, state, report(0, 6.5))
-    assert len(state.without_history("R_a").earlier) == 0
 
 
 def test_the_event_and_the_report_have_the_forecast() -> None:

@@ -57,7 +57,7 @@ def cold(motor: LoadedMachine) -> AdaptationState:
 
 
 def warm(motor: LoadedMachine, store: StateStore) -> AdaptationState:
-    state, note = store.restore(cold(motor), END + 40.0)
+    state, note = store.restore(cold(motor))
     assert note == ""
     assert {event.id for event in state.health.open_events} == {LIMIT, COMPONENT}
     return state
@@ -88,18 +88,18 @@ def test_a_damaged_file_costs_no_more_than_what_was_saved_last(motor: LoadedMach
     )
     damage(store.components_path)
     assert [known.adopted.component.key for known in store.components()] == ["shaft/periodic/t"]  # for the commands
-    again, note = store.restore(cold(motor), END + 60.0)
+    again, note = store.restore(cold(motor))
     assert again.posterior.belief.end == end
     assert again.health.open_events == state.health.open_events
     (kept,) = store.components_path.parent.glob("*.kept.json")
     assert kept.name in note
     assert "saved before it" in note
-    once_more, note = store.restore(cold(motor), END + 60.0)  # it ended before it saved anything
+    once_more, note = store.restore(cold(motor))  # it ended before it saved anything
     assert (note, once_more.posterior.belief.end) == ("", end)
     store.save(again)
     damage(store.components_path)
     store.earlier_path.write_text("[]")
-    last, note = store.restore(cold(motor), END + 60.0)
+    last, note = store.restore(cold(motor))
     assert last.health.open_events == ()
     assert len(list(store.components_path.parent.glob("*.kept.json"))) == 3
     assert all(path.name in note for path in store.components_path.parent.glob("*.kept.json") if path != kept)
@@ -109,7 +109,7 @@ def test_a_file_that_was_moved_away_starts_without_it(motor: LoadedMachine, stor
     store.save(warm(motor, store))
     assert store.earlier_path.exists()
     store.components_path.unlink()
-    state, note = store.restore(cold(motor), END + 60.0)
+    state, note = store.restore(cold(motor))
     assert (state.adopted, note) == ((), "")
 
 
@@ -150,7 +150,7 @@ def test_who_forgets_what_was_learned_clears_its_events(
     before = warm(motor, store)
     state = drop(store, before)
     store.save(state)  # the daemon ends before the next window
-    state, _ = store.restore(cold(motor), END + 48.0)
+    state, _ = store.restore(cold(motor))
     health, document = next_report(motor, state)
     reasons = cleared(document)
     assert reasons.keys() == dropped.keys()
@@ -174,7 +174,7 @@ def test_another_twin_clears_the_events_of_the_one_before(motor: LoadedMachine, 
     store.save(state)
     edited = replace(motor.twin, parameters=motor.twin.parameters[::-1])
     other = StateStore(state.site, state.machine, edited, store.components_path.parent)
-    state, note = other.restore(cold(motor), END + 48.0)
+    state, note = other.restore(cold(motor))
     assert "twin has changed" in note
     _, document = next_report(motor, state)
     reasons = cleared(document)
@@ -212,7 +212,7 @@ def test_screen_page_and_list_agree_on_an_event_whose_state_is_lost(motor: Loade
     writer._write_waiting()
     damage(store.components_path)
 
-    state, _ = store.restore(cold(motor), END + 55.0)
+    state, _ = store.restore(cold(motor))
     state = replace(state, health=state.health.agreeing(writer.last_changes(), REASON))
     _, document = next_report(motor, state, 1)
     document = numbers.number(document)

@@ -154,7 +154,7 @@ def test_evidence_after_a_restart_and_a_decision_is_reproduced(batch: list[Windo
     state = fresh()
     for window in batch[:10]:
         state, _ = adapt(state, window)
-    state = restored(learned_state(state, ""), fresh(), state.posterior.belief.end)
+    state = restored(learned_state(state, ""), fresh())
     kept, decisions = writer(folder), OperatorDecisions(rejected=frozenset({"shaft/Coulomb/omega"}))
     for window in batch[10:]:
         before = apply_decisions(state, decisions) if window.index == 12 else state

@@ -23,11 +23,11 @@ from otolith.adaptation.state import (
     initial_state,
     with_problem,
 )
-from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation.imm_filter import UNKNOWN_AWAY, ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
 from otolith.machine import load_machine
-from otolith.storage.learned_state import learned_state, restored
+from otolith.storage.learned_state import LearnedState, learned_state, restored
 from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.conftest import EXAMPLES
@@ -44,10 +44,10 @@ def store_in(folder: Path, signals: str = "") -> StateStore:
     return StateStore(site, machine, PROBLEM.base_model, folder, signals)
 
 
-def restarted(state: AdaptationState, folder: Path, now: float = START + 30.0) -> AdaptationState:
+def restarted(state: AdaptationState, folder: Path) -> AdaptationState:
     store = store_in(folder)
     store.save(state)
-    warm, note = store_in(folder).restore(fresh(), now)
+    warm, note = store_in(folder).restore(fresh())
     assert note == ""
     return warm
 
@@ -82,11 +82,11 @@ def test_noise_of_inputs_is_restored_and_older_files_lack_it(tmp_path: Path) -> 
     state, levels = healthy(), [2.0 * level for level in PROBLEM.levels]
     document = learned_state(with_problem(state, PROBLEM.with_levels(levels)), "")
     assert document.filter is not None
-    assert restored(document, fresh(), START + 30.0).problem.levels == tuple(levels)
+    assert restored(document, fresh()).problem.levels == tuple(levels)
     older = with_problem(state, PROBLEM.with_levels((*PROBLEM.levels[:2], *levels[2:])))
     for count, known in ((2, older.problem.levels), (0, (*levels[:4], *PROBLEM.levels[4:]))):
         record = document.filter.model_copy(update={"noise": tuple(levels[count:4])})
-        warm = restored(document.model_copy(update={"filter": record}), fresh(), START + 30.0)
+        warm = restored(document.model_copy(update={"filter": record}), fresh())
         assert warm.problem.levels == known
 
 
@@ -97,18 +97,18 @@ def test_the_first_reports_hold_the_truth_however_long_the_daemon_was_away(
 ) -> None:
     """A negative time is a clock that was set back meanwhile."""
     start = START + 24.0 + away
-    warm = restarted(make(), tmp_path, now=start)
+    warm = restarted(make(), tmp_path)
     _, reports = run(warm, windows(simulate_motor("sweep", 4.0, Faults(), seed=11), start))
     assert any(map(holds_truth, reports))
     assert holds_truth(reports[-1])
     assert {item.status for item in reports[0].parameters.values()} <= {Status.ESTIMATED, Status.HELD}
 
 
-def test_variance_grows_by_the_time_away_even_if_the_clock_was_set_back(tmp_path: Path) -> None:
+def test_variance_grows_by_the_time_away_or_by_that_of_an_unknown_time(tmp_path: Path) -> None:
     deviations = []
     (window,) = windows(simulate_motor("sweep", 2.0, Faults(), seed=11), START + 18.0)
-    for away in (0.0, 3600.0, -3600.0):
-        warm = restarted(healthy(), tmp_path, now=START + 18.0 + away)
+    for away in (0.0, UNKNOWN_AWAY, -3600.0):
+        warm = restarted(healthy(), tmp_path)
         predicted = warm.posterior.predict(replace(window, start=START + 18.0 + away))
         deviations.append(math.sqrt(predicted.prior().covariance[0, 0]))
     assert deviations[1] > 3.0 * deviations[0]
@@ -123,7 +123,7 @@ def test_a_step_while_the_daemon_was_away_is_found_as_without_a_restart(
     moved = 1.1 * R_A
     torque = (lambda _, angle, *__: 0.004 * math.sin(angle)) if state.adopted else Faults().torque
     after = windows(simulate_motor("sweep", 16.0, Faults(resistance=moved, torque=torque), seed=12), START + 60.0)
-    warm, reports = run(restarted(state, tmp_path, START + 58.0), after)
+    warm, reports = run(restarted(state, tmp_path), after)
     assert [report.to_json() for report in reports] == [report.to_json() for report in run(state, after)[1]]
     low, high = reports[-1].parameters["R_a"].low, reports[-1].parameters["R_a"].high
     assert low is not None
@@ -170,7 +170,7 @@ def test_only_the_newest_refused_files_are_kept(tmp_path: Path) -> None:
     for number in range(MAX_KEPT + 3):
         store.components_path.parent.mkdir(parents=True, exist_ok=True)
         store.components_path.write_text(f"damaged {number}", encoding="utf-8")
-        _, note = store.restore(fresh(), START)
+        _, note = store.restore(fresh())
         assert "kept" in note
     kept = sorted(path for path in store.components_path.parent.iterdir() if path.name.endswith(".kept.json"))
     assert [path.read_text(encoding="utf-8") for path in kept] == [f"damaged {n}" for n in range(3, MAX_KEPT + 3)]
@@ -190,7 +190,7 @@ def test_a_refused_file_is_kept_although_others_are_from_a_clock_that_was_ahead(
 def test_a_component_is_still_there_after_a_year(tmp_path: Path) -> None:
     torque = lambda _, angle, *__: 0.004 * math.sin(angle)  # noqa: E731 - as in the motor's faults
     after = windows(simulate_motor("sweep", 8.0, Faults(torque=torque), seed=13), START + YEAR)
-    _, reports = run(restarted(unbalanced(), tmp_path, START + YEAR), after)
+    _, reports = run(restarted(unbalanced(), tmp_path), after)
     assert [[component.id for component in report.components] for report in reports] == [[UNBALANCE]] * 4
     assert all(map(holds_truth, reports[1:]))
 
@@ -278,7 +278,7 @@ def refuse_text(store: StateStore, content: bytes, reason: str) -> None:
     store.components_path.write_bytes(content)
     store.save_decisions(OperatorDecisions(approved=frozenset({UNBALANCE})))
     initial = fresh()
-    state, note = store.restore(initial, START + 30.0)
+    state, note = store.restore(initial)
     assert state.posterior is initial.posterior
     assert replace(state.health, dropped=()) == initial.health
     assert not state.health.dropped or json.loads(content)["machine"] == NAMES[0] == state.machine
@@ -297,7 +297,7 @@ def test_a_torn_file_is_refused_wherever_it_ends(tmp_path: Path) -> None:
     for size in range(0, len(whole) - 2, len(whole) // 40):
         store.components_path.write_bytes(whole[:size])
         initial = fresh()
-        state, note = store.restore(initial, START + 30.0)
+        state, note = store.restore(initial)
         assert state is initial
         assert "not used" in note
         assert any(path.read_bytes() == whole[:size] for path in tmp_path.glob("*.kept.json"))
@@ -334,7 +334,7 @@ def check_changed(tmp_path: Path, data: st.DataObject) -> None:
         is_number = isinstance(old, float) and data.draw(st.booleans())
         inner[place[-1]] = old * data.draw(FACTORS) if is_number else data.draw(VALUES)
     store.components_path.write_text(json.dumps(document), encoding="utf-8")
-    state, note = store.restore(fresh(), START + 30.0)
+    state, note = store.restore(fresh())
     assert bool(note) == bool(list(tmp_path.glob("*.kept.json")))
     (window,) = windows(simulate_motor("sweep", 2.0, Faults(), seed=11), START + 30.0)
     _, reports = run(state, [window])
@@ -360,7 +360,7 @@ def test_a_change_of_the_machine_file_keeps_the_components_alone(tmp_path: Path)
     store, document = saved(tmp_path)
     other = replace(PROBLEM, noise=(0.01, 0.02))
     initial = replace(fresh(), posterior=type(fresh().posterior).initial(other))
-    state, note = store.restore(initial, START + 30.0)
+    state, note = store.restore(initial)
     assert [component.key for component in state.problem.components] == [UNBALANCE]
     assert not any(before.known for before in state.previous.values())
     assert "parameters or noise in the machine file have changed" in note
@@ -372,7 +372,7 @@ def test_files_of_version_1_are_read(tmp_path: Path) -> None:
     for path in KEPT.glob("*.json"):
         shutil.copy(path, tmp_path)
     store = store_in(tmp_path, "0123456789abcdef")
-    state, note = store.restore(fresh(), START + 30.0)
+    state, note = store.restore(fresh())
     assert note == ""
     decisions = store.decisions()
     assert decisions == OperatorDecisions(
@@ -385,8 +385,8 @@ def test_files_of_version_1_are_read(tmp_path: Path) -> None:
     assert holds_truth(reports[-1])
     store.save(state)
     assert json.loads(store.components_path.read_text(encoding="utf-8"))["version"] == 2
-    assert store_in(tmp_path, "0123456789abcdef").restore(fresh(), START + 90.0)[0].adopted == state.adopted
-    assert store_in(tmp_path, "of other signals").restore(fresh(), START + 90.0)[0].adopted == ()
+    assert store_in(tmp_path, "0123456789abcdef").restore(fresh())[0].adopted == state.adopted
+    assert store_in(tmp_path, "of other signals").restore(fresh())[0].adopted == ()
 
 
 def test_the_filter_and_events_of_an_earlier_version_2_are_read(tmp_path: Path) -> None:
@@ -397,7 +397,7 @@ def test_the_filter_and_events_of_an_earlier_version_2_are_read(tmp_path: Path) 
     names = machine.file.machine
     store = StateStore(names.site, names.name, machine.twin, tmp_path)
     cold = initial_state(names.name, names.site, machine.problem, machine.plan)
-    state, note = store.restore(cold, 1_795_452_999.0)
+    state, note = store.restore(cold)
     assert note == ""
     assert [known.component.key for known in state.adopted] == ["shaft/periodic/t"]
     assert {event.id for event in state.health.open_events} == {
@@ -406,7 +406,7 @@ def test_the_filter_and_events_of_an_earlier_version_2_are_read(tmp_path: Path) 
     }
     assert state.posterior.belief.end == pytest.approx(1_795_452_960.2, abs=0.1)
     store.save(state)
-    again, note = store.restore(cold, 1_795_452_999.0)
+    again, note = store.restore(cold)
     assert note == ""
     assert again.posterior.belief.end == state.posterior.belief.end
 
@@ -434,7 +434,7 @@ def test_a_refused_file_that_cannot_be_renamed_is_never_overwritten(
     store, _ = saved(tmp_path)
     store.components_path.write_text("damaged", encoding="utf-8")
     monkeypatch.setattr(Path, "rename", refuse)
-    _, note = store.restore(fresh(), START + 30.0)
+    _, note = store.restore(fresh())
     assert "cannot be renamed" in note
     with pytest.raises(OtolithError, match="not overwritten"):
         store.save(healthy())
@@ -473,5 +473,16 @@ def test_records_are_those_that_commissioning_keeps(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     store.save_decisions(OperatorDecisions(resets={EVERYTHING: 5.0}))
     store.save_components(component_records(unbalanced()))
-    state = apply_decisions(store.restore(fresh(), START + 30.0)[0], store.decisions())
+    state = apply_decisions(store.restore(fresh())[0], store.decisions())
     assert [component.key for component in state.problem.components] == [UNBALANCE]
+
+
+def test_a_history_that_an_older_file_kept_apart_while_its_clock_was_set_back_goes_on() -> None:
+    history, short = [[START + at, 6.5, 1e-4] for at in range(30)], [[10.0, 6.5, 1e-4]]
+    content = learned_state(healthy(), "").model_dump(mode="json")
+    content["health"] |= {"histories": {"R_a": short, "D": short}, "earlier": {"R_a": [10.0, history]}}
+    histories = LearnedState.model_validate(content).health.histories
+    assert [len(histories[name]) for name in ("R_a", "D")] == [30, 1]
+    content["health"]["earlier"] = 5
+    with pytest.raises(ValueError, match="earlier"):
+        LearnedState.model_validate(content)

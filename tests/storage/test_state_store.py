@@ -131,7 +131,7 @@ def test_what_is_no_file_in_the_place_of_a_file_is_refused(store: StateStore, ot
         else:
             path.mkdir()
     initial = with_friction(-0.003)
-    state, note = store.restore(initial, 0.0)
+    state, note = store.restore(initial)
     assert state is initial
     assert "not a file; the file is kept as" in note
     with pytest.raises(ConfigurationError, match="not a file"):

@@ -213,7 +213,7 @@ class Playback:
         self._checked = now
         begun = self.windower.begin(self._rings, now, now - self._begun)
         while begun and self.windower.due(self._rings, now):
-            window = self.windower.cut(self._rings, unix_offset=0.0)
+            window = self.windower.cut(self._rings, offset=0.0)
             self.counts.repeated, self.counts.stale = self.windower.counts.repeated, self.windower.counts.stale
             self._windows += 1
             yield replace(window, index=self._windows - 1)

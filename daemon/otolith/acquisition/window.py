@@ -138,7 +138,7 @@ class Window:
     """Records of all signals of a machine. Frozen and picklable."""
 
     index: int
-    start: float  # Unix seconds of the first record
+    start: float  # Seconds of the first record, on the clock of the windows: service time, or the time of a log
     grid: TimeGrid
     signals: tuple[str, ...]
     values: Array  # (records, signals), each in the unit of its signal; an input is bridged between its samples
@@ -151,6 +151,7 @@ class Window:
     """Of several sources, those that are down or gave no sample: in words, by name."""
     outages: Mapping[str, str] = field(default_factory=dict)
     """Outputs of the daemon that do not work, and why, by name."""
+    ahead: float = 0.0  # Unix time minus that clock, s; only texts have Unix times
 
     @classmethod
     def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:
@@ -171,7 +172,7 @@ class Window:
 
     @property
     def end(self) -> float:
-        """Unix seconds at which the last record ends."""
+        """Seconds at which the last record ends, on the clock of ``start``."""
         return self.start + self.grid.length
 
     def since(self, record: int) -> Self:

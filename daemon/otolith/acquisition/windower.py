@@ -114,8 +114,11 @@ class Windower:
         )
         return complete or now >= self.deadline
 
-    def cut(self, rings: Rings, unix_offset: float) -> Window:
-        """Return the next window; ``unix_offset`` is Unix time minus monotonic time, s."""
+    def cut(self, rings: Rings, offset: float, ahead: float = 0.0) -> Window:
+        """Return the next window.
+
+        ``offset`` is the time of windows minus monotonic time, and ``ahead`` Unix time minus the time of windows, s.
+        """
         samples = self._align(rings)
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
             self._start += self._grid_shift(samples.cyclic, first=True)
@@ -124,14 +127,15 @@ class Windower:
         records = replace(records, ambiguous=samples.ambiguous)
         window = Window(
             index=self._index,
-            start=self._start + unix_offset,
+            start=self._start + offset,
             grid=records.grid,
             signals=self.signals,
             values=records.values,
             missing=records.missing,
-            quality=assess_quality(records, self.plans, samples.cyclic, self._limits, self._span(unix_offset)),
+            quality=assess_quality(records, self.plans, samples.cyclic, self._limits, self._span(offset + ahead)),
             bridge_error=records.bridge_error,
             observed=rings.observed_means(self._start, self.next_end),
+            ahead=ahead,
         )
         self.counts.repeated += samples.repeated
         self.counts.stale += records.stale

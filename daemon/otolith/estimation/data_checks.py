@@ -313,7 +313,7 @@ def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
     """Return the finding that a sensor is clipped in ``runs``."""
     window, name = channel.window, channel.name
     limit = float(np.median(channel.values[runs[0]]))
-    when = time_text(window.start + float(window.grid.offsets[runs[0][0]]))
+    when = time_text(window.start + window.ahead + float(window.grid.offsets[runs[0][0]]))
     text = (
         f"{name} is clipped at {limit:.4g} {unit_text(channel.output.unit)} from {when}: "
         f"{_samples_in(runs)} of {window.records} records do not count"
@@ -473,7 +473,7 @@ def _frozen_sentence(channel: _Channel, run: _FrozenRun) -> str:
     is_at_end = (value == values.max() and run.excess > 0.0) or (value == values.min() and run.excess < 0.0)
     kind = "clipped" if np.ptp(values) > 0.0 and is_at_end else "frozen"
     length, count = f"{times[-1] - times[0]:.4g} s", len(run.records)
-    when = f"for {length} ({count} samples) from {time_text(window.start + float(times[0]))}"
+    when = f"for {length} ({count} samples) from {time_text(window.start + window.ahead + float(times[0]))}"
     if count == len(channel.present):  # it may be so for longer: the finding has the time of the first window
         when = f"throughout the window of {length} ({count} samples)"
     return f"{channel.name} is {kind} at {value:.6g} {unit_text(channel.output.unit)} {when} while the twin moves on"

@@ -30,6 +30,7 @@ CALMER_FACTOR = 1.5  # how much more probable a calmer mode must be to become th
 NEW_MODE_WEIGHT = 0.02  # probability of a mode that enters the bank
 MIN_MODE_WEIGHT = 1e-12
 TREND_MEMORY = 300.0  # s: time constant with which an unconfirmed trend decays
+UNKNOWN_AWAY = 86_400.0  # s: what a time that no clock measured counts as, between two windows
 MAX_GAP = 1e7  # s between windows: the modes are stationary by then
 VARIANCE_RATIO_GAIN = 0.1  # share of the newest window in the variance ratio
 MAX_VARIANCE_RATIO = 1e4
@@ -53,7 +54,7 @@ class ImmPosterior:
     mean: Array  # (modes, 2 free) at end
     covariance: Array  # (modes, 2 free, 2 free)
     weight: Array  # (modes,) probabilities
-    end: float  # Unix seconds at which the last window ends; minus infinity before the first window
+    end: float  # End of the last window, s on the clock of the windows; minus infinity before the first window
     variance_ratio: float = 1.0  # Variance between windows over the variance that they state; one if they agree
 
 
@@ -113,13 +114,13 @@ def process_model(elapsed: float) -> tuple[Array, Array]:
 
 
 def predict(posterior: ImmPosterior, end: float) -> ImmPosterior:
-    """Return the prediction at ``end`` (Unix s).
+    """Return the prediction at ``end`` (s on the clock of the windows).
 
-    If the clock was set back, the time since is unknown, and counts as the difference.
+    If ``end`` lies before the last window, as in a log that begins again, the time since is unknown.
     """
     if not np.isfinite(posterior.end):
         return replace(posterior, end=end)
-    elapsed = abs(end - posterior.end)
+    elapsed = end - posterior.end if end >= posterior.end else UNKNOWN_AWAY
     if elapsed == 0.0:
         return posterior
     posterior = _mix(posterior)

@@ -487,7 +487,7 @@ def unbridged_gap(estimated: WindowEstimate) -> str:
     name = max(gaps, key=lambda name: gaps[name].length, default="")
     if not name or gaps[name].length < MIN_GAP_SHARE * window.grid.length or not _determines_without(estimated):
         return ""
-    where = f"{name} has no sample for {gaps[name].length:.4g} s from {time_text(gaps[name].start)}"
+    where = f"{name} has no sample for {gaps[name].length:.4g} s from {time_text(gaps[name].start + window.ahead)}"
     remedy = "look at its source, or accept less with [estimation] determined_within"
     return f"{where}, and no parameter can be determined within what is asked for: {remedy}"
 

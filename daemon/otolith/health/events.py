@@ -26,7 +26,7 @@ from otolith.health.observations import (
     is_determined,
     observe,
 )
-from otolith.health.prognosis import Earlier, History, forecast, is_due, span, with_clock, with_point
+from otolith.health.prognosis import History, forecast, is_due, span, with_point
 from otolith.health.schema import (
     EventChange,
     EventDocument,
@@ -75,7 +75,6 @@ class HealthState:
     steps: Mapping[str, float] = field(default_factory=dict)  # Last sudden change of each parameter
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
-    earlier: Mapping[str, Earlier] = field(default_factory=dict)  # Histories from before the clock was set back
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
     undetermined: Mapping[str, float] = field(default_factory=dict)
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
@@ -94,9 +93,8 @@ class HealthState:
     def without_history(self, name: str) -> "HealthState":
         """Return the state without history and forecast of a parameter."""
         histories = {key: history for key, history in self.histories.items() if key != name}
-        earlier = {key: item for key, item in self.earlier.items() if key != name}
         forecasts = {key: item for key, item in self.forecasts.items() if key != name}
-        return replace(self, histories=histories, earlier=earlier, forecasts=forecasts)
+        return replace(self, histories=histories, forecasts=forecasts)
 
     def without_learned(self, reason: str) -> "HealthState":
         """Return the state of a machine of which nothing was learned; events of what was learned are dropped."""
@@ -273,7 +271,7 @@ def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str
 
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of this window in the histories, and with the forecasts that are due."""
-    histories, earlier, forecasts = dict(state.histories), dict(state.earlier), dict(state.forecasts)
+    histories, forecasts = dict(state.histories), dict(state.forecasts)
     for name, item in report.parameters.items():
         quantity = plan.parameters.get(name)
         is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
@@ -285,19 +283,17 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
             time, value, sd = 0.5 * (report.window.start + report.window.end), item.raw, item.raw_sd
         if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
             continue
-        history, before = with_clock(histories.get(name, ()), earlier.pop(name, None), time)
-        earlier |= {} if before is None else {name: before}
-        histories[name] = with_point(history, time, referred[0], referred[1] ** 2)
+        histories[name] = with_point(histories.get(name, ()), time, referred[0], referred[1] ** 2)
         if is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(quantity, histories[name])
-    return replace(state, histories=histories, earlier=earlier, forecasts=forecasts)
+    return replace(state, histories=histories, forecasts=forecasts)
 
 
 def _advance(
     plan: MonitoringPlan, before: ConditionRecord, observed: Observation, report: ReportDocument
 ) -> ConditionRecord:
     """Return the record after an observation, with its event; one that the window clears has an end."""
-    event = before.event and _until(before.event, report.window.start)
+    event = before.event and before.event.model_copy(update={"change": None})
     if observed.level is None:
         is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
         return replace(before, event=event, recent=() if is_interrupted else before.recent)
@@ -312,7 +308,9 @@ def _advance(
         event = _raised(plan, observed, level, (first, report.window))
     elif event is not None and level is not before.level:
         is_over = level is Level.OK
-        changed = {"end": first.start} if is_over else {"state": level, "since": first.start}
+        # A log may go back in time: an event keeps its begin, and ends after it.
+        begin = max(first.start, event.since)
+        changed = {"end": begin} if is_over else {"state": level, "since": begin}
         change = EventChange.CLEARED if is_over else EventChange.CHANGED
         event = event.model_copy(update={"change": change, **changed})
     others: tuple[str, ...] = ()
@@ -326,11 +324,6 @@ def _advance(
         event = described if is_other or not others else event
     kept = recent[-count:] if level.rank < before.level.rank else recent  # what is over does not count again
     return ConditionRecord(level, kept, event, observed.persistence, before.cleared, others)
-
-
-def _until(event: EventDocument, now: float) -> EventDocument:
-    """Return an event without a change, which began before ``now``: the clock may have been set back since."""
-    return event.model_copy(update={"change": None, "start": min(event.start, now), "since": min(event.since, now)})
 
 
 def _ended(plan: MonitoringPlan, event: EventDocument, now: float) -> EventDocument:
@@ -400,18 +393,23 @@ def _states(
         elif missing := _undetermined(plan, part, report):
             key = "no_longer" if any(name in determined for name in missing) else "not_yet"
             reason = plan.texts(key, names=", ".join(missing))
-            parts[part] = _kept(earlier, Level.NO_DATA, report.window.start, reason, missing)
+            parts[part] = _kept(earlier, Level.NO_DATA, _begin(earlier, report), reason, missing)
         else:
-            parts[part] = _kept(earlier, Level.OK, report.window.start, "", ())
+            parts[part] = _kept(earlier, Level.OK, _begin(earlier, report), "", ())
     levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
     is_known = any(parts[part].state is not Level.NO_DATA for part in plan.parts) or not plan.parts
     state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not no_data else Level.NO_DATA)
     same = [item for item in parts.values() if item.state is state]
     reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
-    since = min(item.since for item in same) if levels else report.window.start
+    since = min(item.since for item in same) if levels else _begin(before, report)
     unknown = tuple(name for item in same for name in item.undetermined)
     whole = _kept(before, state, since, reason, unknown)
     return HealthDocument(**dict(whole), parts=parts, language=plan.language)
+
+
+def _begin(before: PartDocument | None, report: ReportDocument) -> float:
+    """Return when a state begins with a window: not before the one before it, although a log may go back in time."""
+    return report.window.start if before is None else max(report.window.start, before.since)
 
 
 def _kept(

@@ -30,6 +30,7 @@ MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
 DAEMON, OUTPUT = "daemon", "output/"  # part to which an output belongs that does not work, and begin of its key
+CLOCK = "clock"  # of the computer: it has events, and no state
 PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}  # Of findings about no part
 NOTHING = FindingFeatures(FindingKind.OPEN)
 

@@ -42,11 +42,9 @@ REFINED = 0.2  # of the points of a grid: how many must have weight so that it i
 MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, from which on it counts
 FACTOR_SHAPE = 1.5  # of the inverse gamma prior of the factor on the variances, and its scale: its mode is 0.6
 UNKNOWN_CONSTANT = 100.0  # standard deviation of the constant, over that of the change
-CLOCK_PATIENCE = 86_400.0  # s for which a history from before the clock was set back is kept
 BISECTIONS = 40  # of the time of a crossing: more than a number has digits
 
-History = tuple[tuple[float, float, float], ...]  # Time (Unix s), value and variance of a parameter; the times rise
-Earlier = tuple[float, History]  # The time (Unix s) to which the clock was set back, and the history before
+History = tuple[tuple[float, float, float], ...]  # Time (s), value and variance of a parameter; the times rise
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +124,8 @@ class Trend:
 def with_point(history: History, time: float, value: float, variance: float) -> History:
     """Return the history with another point and at most :data:`MAX_POINTS`, whose density falls with the root of age.
 
-    Two neighbours become their mean, weighted by their precisions. Points that are not before ``time`` are dropped: the
-    clock was set back.
+    Two neighbours become their mean, weighted by their precisions. Points that are not before ``time`` are dropped: a
+    log may begin again.
     """
     kept = [*(point for point in history if point[0] < time), (time, value, variance)]
     if len(kept) > MAX_POINTS:
@@ -138,15 +136,6 @@ def with_point(history: History, time: float, value: float, variance: float) -> 
         middle, mean = (precision @ pair[:, :2] / precision.sum()).tolist()
         kept[first : first + 2] = [(middle, mean, float(1.0 / precision.sum()))]
     return tuple(kept)
-
-
-def with_clock(history: History, earlier: Earlier | None, time: float) -> tuple[History, Earlier | None]:
-    """Return the history that goes on at ``time``, and that from before the clock was set back, while it may go on."""
-    if history and time <= history[-1][0]:
-        return history, earlier or (time, history)
-    if earlier is not None and time > earlier[1][-1][0]:  # set right again
-        return earlier[1], None
-    return history, None if earlier is None or time - earlier[0] > CLOCK_PATIENCE else earlier
 
 
 def is_plausible(history: History) -> bool:

@@ -114,6 +114,7 @@ class EventChange(StrEnum):
     RAISED = "raised"
     CHANGED = "changed"
     CLEARED = "cleared"
+    NOTED = "noted"  # It happened at one moment, at which it also ends: the clock was set
 
 
 class EvidenceDocument(DocumentModel):

@@ -20,6 +20,7 @@ from otolith.estimation.information import QUANTILE
 from otolith.health.schema import (
     ComponentDocument,
     CrossingDocument,
+    EventChange,
     EventDocument,
     FindingDocument,
     HealthDocument,
@@ -168,6 +169,8 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text)
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
     texts = texts_in(event.language)
     part, condition = texts.translated(event.part), event.condition
+    if event.change is EventChange.NOTED:
+        return texts("noted", part=part, text=event.text, time=when(event.start))
     if event.end is not None:
         line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
         return f"{line}; {texts('dropped', reason=event.reason)}" if event.reason else line

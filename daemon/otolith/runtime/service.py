@@ -14,7 +14,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from multiprocessing.connection import wait
@@ -28,13 +28,15 @@ from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_problem, with_sample_grid
 from otolith.health.diagnosis import MonitoringPlan
-from otolith.health.schema import CountersDocument, Report, ReportDocument
+from otolith.health.labels import clock_event
+from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import protect_files
+from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
 from otolith.runtime.process import SIGNALS, EventCommand, RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
@@ -147,9 +149,16 @@ class Service:
     """One machine, from :meth:`run` to the signal that stops it."""
 
     def __init__(
-        self, machine: LoadedMachine, listen: tuple[str, ...] | None = None, recording: Path | None = None
+        self,
+        machine: LoadedMachine,
+        listen: tuple[str, ...] | None = None,
+        recording: Path | None = None,
+        clocks: Callable[[], ClockReading] = read_clocks,
     ) -> None:
-        """``listen`` and ``recording`` replace the endpoints and the recording file that the machine file gives."""
+        """``listen`` and ``recording`` replace the endpoints and the recording file that the machine file gives.
+
+        ``clocks`` reads the clocks of the computer.
+        """
         file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
         self._machine, self._outputs = machine, {output.name for output in machine.twin.outputs}
         self._listen = file.zenoh.listen if listen is None else listen
@@ -160,6 +169,8 @@ class Service:
         self._writer = StateWriter(self._store, self._store.decisions_time())
         self._history = history_of(file)
         self._evidence = EvidenceWriter(machine)
+        self._read_clocks, self._clock = clocks, ServiceClock(read=clocks)
+        self._clock_events: tuple[EventDocument, ...] = ()  # that the next report has
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
@@ -216,6 +227,7 @@ class Service:
             raise
         except ServiceError as error:  # what is learned may be lost, but the machine is monitored
             self._writer.fail(error)
+        self._start_clock()
         self._supervisor.state = self._restored(self._supervisor.state)
         self._start_history()
         self._windower.records = self._supervisor.records
@@ -250,9 +262,18 @@ class Service:
             self._save(math.inf)
             self._notifier.send("STOPPING=1")
 
+    def _start_clock(self) -> None:
+        """Continue the service time of the daemon before, as its state or its history have it."""
+        (saved, last), labels = self._store.saved_clock(), None
+        if self._history is not None:
+            with contextlib.suppress(OtolithError):  # an unreadable history must not prevent monitoring
+                last, labels = max(last, self._history.reader.last()), self._history.reader.labels()
+        self._clock = ServiceClock(saved, last, labels, self._read_clocks)
+        self._store.clock = self._clock.saved
+
     def _restored(self, state: AdaptationState) -> AdaptationState:
         """Return ``state`` with what was saved and decided; an unreadable file must not prevent monitoring."""
-        state, note = self._store.restore(state, time.time())
+        state, note = self._store.restore(state)
         polled = {name for name, plan in self._windower.plans.items() if plan.sampling is Sampling.POLLED}
         changing = tuple(name for name in state.problem.changing if name not in polled)  # without those declared since
         state = with_problem(state, replace(state.problem, changing=changing))
@@ -265,7 +286,7 @@ class Service:
             log.warning("%s", text)
         self._notes, self._saved = tuple(notes), _keys(state)
         if math.isfinite(end := state.posterior.belief.end):
-            log.info("started with what was learned up to %s", time_text(end))
+            log.info("started with what was learned up to %s", time_text(self._clock.labels.unix(end)))
         if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
             names = ", ".join(known.component.key for known in state.adopted)
@@ -274,7 +295,7 @@ class Service:
 
     def _start_history(self) -> None:
         if self._history is not None:
-            self._numbers, note = self._history.open(time.time())
+            self._numbers, note = self._history.open(max(self._clock.now(), time.time()))
             self._notes += (note,) if note else ()
             state, reason = self._supervisor.state, "its state was not saved before the daemon ended"
             health = state.health.agreeing(self._history.last_changes(), reason)
@@ -315,7 +336,8 @@ class Service:
             self._recorder.poll(time.monotonic())
 
     def _cut(self, now: float) -> None:
-        window = self._windower.cut(self._rings, time.time() - time.monotonic())
+        self._follow_wall_clock()
+        window = self._windower.cut(self._rings, self._clock.offset, self._clock.ahead)
         link = self._machine.driver.link()
         self._windower.latency = link.latency
         self._adopt_achieved_period(link.period)
@@ -339,6 +361,15 @@ class Service:
         }
         return {name: reason for name, reason in outages.items() if reason}
 
+    def _follow_wall_clock(self) -> None:
+        """Let the labels follow the wall clock. If it was set, save them, and note it in the next report."""
+        by = self._clock.update()
+        self._store.clock = self._clock.saved
+        if by is not None:
+            self._saved_at = -math.inf
+            event = clock_event(self._clock.now(), by, self._windows, self._machine.file.machine.language)
+            self._clock_events = (*self._clock_events, event)
+
     def _adopt_achieved_period(self, period: float | None) -> None:
         """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
         current = self._windower.sample_period
@@ -352,16 +383,20 @@ class Service:
         log.warning("%s: windows now have %s", change, size)
 
     def _publish(self, report: Report, seconds: float) -> None:
-        document = report.document
-        latency = max(0.0, time.time() - document.window.end)
+        document, noted = report.document, self._clock_events
+        self._clock_events = ()
+        latency = max(0.0, self._clock.now() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         driver = driver_document(self._machine.driver.link())
         parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
+        update["events"] = (*noted, *document.events)
         document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
         if self._history is not None:
             self._describe()
+            self._history.labels = self._clock.labels
             self._history.add(document)
+        document = self._clock.labels.of_report(document)
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._recorder.is_enabled:

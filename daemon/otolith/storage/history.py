@@ -1,21 +1,24 @@
 """The history of one machine in an SQLite database: what it keeps, and how it is read.
 
 A value of each parameter and window is kept, and merged into its minute, hour and day at once, so that nothing has to
-be summarised later. Times are Unix seconds. Writer and retention: :mod:`otolith.storage.history_writer`; any number of
-processes may read meanwhile.
+be summarised later. Times in the tables are service times, in s, and so are those of the documents in them; what is
+read has Unix times, as the labels say that are known by then. Writer and retention:
+:mod:`otolith.storage.history_writer`; any number of processes may read meanwhile.
 """
 
 import contextlib
 import json
 import logging
+import math
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.labels import TimeLabels
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, PartDocument, ReportDocument
 from otolith.storage.history_schema import check, upgrade
@@ -39,6 +42,8 @@ COMPRESSION = 1  # level of zlib
 LATEST_CHANGES = 2000  # changes of events that are searched for those that were left open
 FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
 
+# By sequence: versions without labels wrote the time of a wrong clock.
+_SINCE = "WHERE sequence >= (SELECT min(sequence) FROM event WHERE time >= ?)"
 _SAMPLE = """
 INSERT INTO sample VALUES (?, ?, ?, 1, ?4, ?4, ?4, ?4, ?5, ?6, ?7) ON CONFLICT DO UPDATE SET
     count = count + 1, min = min(min, excluded.min), mean = mean + (excluded.mean - mean) / (count + 1),
@@ -113,6 +118,7 @@ class Tables:
         self._description = ""
         self._states: dict[str, tuple[str, float, int]] = {}
         """The last state of each part as it is written: with the begin of its cause, and its sequence number."""
+        self._labels: TimeLabels | None = None
 
     def describe(self, text: str) -> None:
         """Write the description of the machine, as :func:`describe_machine` returns it, if it has changed."""
@@ -121,8 +127,15 @@ class Tables:
             self._connection.execute("INSERT INTO description VALUES (?)", (text,))
             self._description = text
 
+    def label(self, labels: TimeLabels) -> None:
+        """Write the Unix times of service times, if they have changed."""
+        if labels != self._labels:
+            self._connection.execute("DELETE FROM label")
+            self._connection.executemany("INSERT INTO label VALUES (?, ?)", labels.spans)
+            self._labels = labels
+
     def add(self, document: ReportDocument) -> None:
-        """Write a report, its values, its states and events that changed, its findings and its counters."""
+        """Write a report with service times: its values, findings and counters, and states and events that changed."""
         execute, end = self._connection.execute, document.window.end
         text = zlib.compress(document.to_json().encode(), COMPRESSION)
         execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, text))
@@ -153,7 +166,7 @@ class Tables:
         """Read the numbers of the series again: a transaction that added some was rolled back."""
         self._series.clear()
         self._states.clear()
-        self._description = ""
+        self._description, self._labels = "", None
 
     def _add_states(self, parts: Mapping[str, PartDocument], sequence: int, end: float) -> None:
         """Write the states that were entered at ``end``; a part that the report does not name any more is at OK."""
@@ -220,31 +233,35 @@ class HistoryReader:
         return [name for (name,) in self._rows("SELECT DISTINCT name FROM series ORDER BY id")]
 
     def samples(self, resolution: int, since: float, names: Sequence[str] = ()) -> list[HistorySample]:
-        """Return the values since a time, of the parameters ``names`` or of all, in the order of time."""
+        """Return the values since a time, of the parameters ``names`` or of all, in the order in which they came."""
         chosen = f"AND name IN ({', '.join('?' * len(names))})" if names else ""
         columns = ", ".join(column.name for column in fields(HistorySample))
         query = (
             f"SELECT {columns} FROM sample JOIN series ON series.id = series "  # noqa: S608 - no text of a user
             f"WHERE resolution = ? AND time >= ? {chosen} ORDER BY time, series.id"
         )
-        return [HistorySample(*row) for row in self._rows(query, resolution, since, *names)]
+        labels = self.labels()
+        samples = (HistorySample(*row) for row in self._rows(query, resolution, labels.first(since), *names))
+        return [replace(sample, time=labels.unix(sample.time)) for sample in samples] if labels.spans else [*samples]
 
     def first(self, resolution: int) -> float | None:
         """Return the time of the oldest value of a resolution; None if there is none."""
         ((time,),) = self._rows("SELECT min(time) FROM sample WHERE resolution = ?", resolution)
-        return None if time is None else float(time)
+        return None if time is None else self.labels().unix(time)
 
     def events(self, since: float) -> list[EventDocument]:
         """Return the changes of events since a time, in the order in which they were published."""
-        rows = self._rows("SELECT text FROM event WHERE time >= ? ORDER BY sequence", since)
-        return self._undamaged(rows, EventDocument.model_validate_json)
+        labels = self.labels()
+        rows = self._rows(f"SELECT text FROM event {_SINCE} ORDER BY sequence", labels.first(since))  # noqa: S608 - our own text
+        return self._undamaged(rows, lambda text: labels.of_event(EventDocument.model_validate_json(text)))
 
     def event_ends(self, since: float) -> dict[int, float]:
-        """Return the end of the window of each change of an event since a time, by its sequence number."""
-        return dict(self._rows("SELECT sequence, time FROM event WHERE time >= ?", since))
+        """Return the end (service time) of the window of each change of an event since a time, by sequence number."""
+        query = f"SELECT sequence, time FROM event {_SINCE}"  # noqa: S608 - our own text
+        return dict(self._rows(query, self.labels().first(since)))
 
     def last_changes(self) -> dict[str, EventDocument]:
-        """Return the last change of each event by its id, the latest first, among ``LATEST_CHANGES`` changes."""
+        """Return the last change of each event by its id (service times, of ``LATEST_CHANGES``), the latest first."""
         rows = self._rows("SELECT text FROM event ORDER BY sequence DESC LIMIT ?", LATEST_CHANGES)
         changes: dict[str, EventDocument] = {}
         for event in self._undamaged(rows, EventDocument.model_validate_json):
@@ -254,17 +271,23 @@ class HistoryReader:
     def findings(self, since: float) -> list[dict[str, Any]]:
         """Return the findings since a time: ``first``, ``last``, ``count`` of windows, and the latest document."""
         query = "SELECT first, last, count, text FROM finding WHERE last >= ? ORDER BY first"
-        rows = self._rows(query, since)
+        labels = self.labels()
+        rows = self._rows(query, labels.first(since))
 
         def parse(first: float, last: float, count: int, text: str) -> dict[str, Any]:
-            return {"first": first, "last": last, "count": count, **json.loads(text)}
+            document = {**json.loads(text)}
+            times = {"first": first, "last": last, "since": document.get("since", first)}
+            return {**document, "count": count, **{name: labels.unix(time) for name, time in times.items()}}
 
         return self._undamaged(rows, parse)
 
     def counters(self, since: float) -> list[dict[str, Any]]:
         """Return the last counters of each hour and start (``run``) of the daemon since a time."""
-        rows = self._rows("SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
-        return self._undamaged(rows, lambda hour, run, text: {"hour": hour, "run": run, **json.loads(text)})
+        labels, query = self.labels(), "SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour"
+        rows = self._rows(query, labels.first(since) - HOUR)
+        return self._undamaged(
+            rows, lambda hour, run, text: {"hour": labels.unix(hour), "run": run, **json.loads(text)}
+        )
 
     def states(self, since: float) -> list[PartState]:
         """Return the states of the parts in the order in which they were entered, from those at ``since`` on."""
@@ -273,18 +296,33 @@ class HistoryReader:
             f"SELECT part, entered, since, state FROM state LEFT JOIN ({before}) USING (part) "  # noqa: S608 - our own text
             "WHERE sequence >= coalesce(first, sequence) ORDER BY sequence"
         )
-        rows = self._rows(query, since)
-        return self._undamaged(rows, lambda part, entered, since, state: PartState(part, entered, since, Level(state)))
+        labels = self.labels()
+
+        def parse(part: str, entered: float, since: float, state: str) -> PartState:
+            return PartState(part, labels.unix(entered), labels.unix(since), Level(state))
+
+        return self._undamaged(self._rows(query, labels.first(since)), parse)
 
     def description(self) -> dict[str, Any]:
         """Return what :func:`describe_machine` wrote; empty if nobody did."""
         rows = self._rows("SELECT text FROM description")
         return next(iter(self._undamaged(rows, lambda text: dict(json.loads(text)))), {})
 
+    def labels(self) -> TimeLabels:
+        """Return the Unix times of service times, as they are known now."""
+        rows = self._rows("SELECT begin, ahead FROM label ORDER BY begin")
+        return TimeLabels(tuple((begin, ahead) for begin, ahead in rows))
+
+    def last(self) -> float:
+        """Return the service time at which the window of the newest report ends; minus infinity if there is none."""
+        rows = self._rows("SELECT time FROM report ORDER BY sequence DESC LIMIT 1")
+        return float(rows[0][0]) if rows else -math.inf
+
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""
         rows = self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", count)
-        reports = self._undamaged(rows, lambda text: ReportDocument.from_json(_unpacked(text)))
+        labels = self.labels()
+        reports = self._undamaged(rows, lambda text: labels.of_report(ReportDocument.from_json(_unpacked(text))))
         if rows and not reports:
             raise ConfigurationError(f"{self.path}: cannot be read: the disk has damaged the last {len(rows)} reports")
         return reports
@@ -292,7 +330,7 @@ class HistoryReader:
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
     ) -> list[str]:
-        """Return the first ``limit`` documents of a ``kind``, ``report`` or ``event``, as they were published.
+        """Return the first ``limit`` documents of a ``kind``, ``report`` or ``event``, with the labels that hold now.
 
         They have a sequence number above ``after``, and their windows end from ``start`` to ``end``.
         """
@@ -301,8 +339,19 @@ class HistoryReader:
             "WHERE sequence > ?1 AND (?2 IS NULL OR time >= ?2) AND (?3 IS NULL OR time <= ?3) "
             "ORDER BY sequence LIMIT ?4"
         )
-        rows = self._rows(query, after, start, end, limit)
-        return self._undamaged(rows, _unpacked)
+        labels = self.labels()
+        begin, until = start and labels.first(start), end and labels.last(end)
+        rows = self._rows(query, after, begin, until, limit)
+
+        def published(row: bytes | str) -> str:
+            text = _unpacked(row)
+            if not labels.spans:
+                return text
+            if kind == "event":
+                return labels.of_event(EventDocument.model_validate_json(text)).model_dump_json(exclude_none=True)
+            return labels.of_report(ReportDocument.from_json(text)).to_json()
+
+        return self._undamaged(rows, published)
 
     def _undamaged(self, rows: Iterable[tuple[Any, ...]], parse: Callable[..., Content]) -> list[Content]:
         """Return what ``parse`` returns for each row, without those whose content the disk has damaged."""

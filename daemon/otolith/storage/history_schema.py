@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable
 from typing import Literal
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
 PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
 
@@ -34,6 +34,7 @@ CREATE TABLE {place}.state (
     PRIMARY KEY (part, sequence)) WITHOUT ROWID
 """
 _DESCRIPTION = "CREATE TABLE {place}.description (text TEXT NOT NULL)"
+_LABEL = "CREATE TABLE {place}.label (begin REAL PRIMARY KEY, ahead REAL NOT NULL)"  # See otolith.health.labels
 
 
 class NewerVersionError(ValueError):
@@ -46,8 +47,8 @@ def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
     connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute("PRAGMA journal_mode = WAL")
-    tables = f"{_SCHEMA}{_STATE.format(place='main')}; {_DESCRIPTION.format(place='main')};"
-    connection.executescript(f"BEGIN; {tables} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
+    later = "; ".join(table.format(place="main") for table in (_STATE, _DESCRIPTION, _LABEL))
+    connection.executescript(f"BEGIN; {_SCHEMA}{later}; PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
     with connection:
         connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
 
@@ -121,5 +122,10 @@ def _from_1(connection: sqlite3.Connection, place: Place) -> None:
     connection.executemany(f"INSERT INTO {place}.state VALUES (?, ?, ?, ?, ?)", numbered)  # noqa: S608 - our own names
 
 
-_UPGRADES: dict[int, Callable[[sqlite3.Connection, Place], None]] = {1: _from_1}
+def _from_2(connection: sqlite3.Connection, place: Place) -> None:
+    """Version 2 had Unix times, and whatever the clock said: they are the labels of themselves."""
+    connection.execute(_LABEL.format(place=place))
+
+
+_UPGRADES: dict[int, Callable[[sqlite3.Connection, Place], None]] = {1: _from_1, 2: _from_2}
 """By the version that they upgrade to the next one."""

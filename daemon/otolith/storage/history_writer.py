@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from otolith.health.labels import TimeLabels
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
 from otolith.storage.disk import WriterThread, give_to, opened_folder
@@ -69,33 +70,34 @@ class Retention:
 
     def __init__(self, connection: sqlite3.Connection, bounds: Bounds) -> None:
         self._connection, self._bounds = connection, bounds
+        self.labels = TimeLabels()  # Of the service times in the tables
         (self._page_size,) = connection.execute("PRAGMA page_size").fetchone()
         self._limit()
 
     def by_age(self, now: float, elapsed: float) -> None:
         """Delete what is too old at the Unix time ``now``, ``elapsed`` s of operation after the last call."""
-        clock, longest = self._clock(now, elapsed), self._bounds.days * DAY
+        clock, longest, first = self._clock(now, elapsed), self._bounds.days * DAY, self.labels.first
         for resolution in (*AGES, DAY):
-            oldest = clock - min(AGES.get(resolution, longest), longest)
+            oldest = first(clock - min(AGES.get(resolution, longest), longest))
             while self._delete_samples(resolution, oldest):
                 pass
         # By sequence: reports with the time of a wrong clock, ahead or behind, go with those around them.
-        resend = clock - min(self._bounds.resend_hours * HOUR, longest)
+        resend = first(clock - min(self._bounds.resend_hours * HOUR, longest))
         recent = "coalesce((SELECT min(sequence) FROM report WHERE time BETWEEN ?1 AND ?2), 9e18)"
         latest = f"(SELECT max(sequence) FROM report WHERE time < ?1 AND sequence < {recent})"  # noqa: S608 - our own names
-        while self._delete_reports(f"sequence <= {latest}", resend, clock + MAX_AHEAD):
+        while self._delete_reports(f"sequence <= {latest}", resend, first(clock + MAX_AHEAD)):
             pass
         for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour")):
-            self._delete(f"DELETE FROM {table} WHERE {column} < ?", clock - longest)  # noqa: S608 - our own names
-        self._delete(f"DELETE FROM state WHERE sequence < ({LAST_STATE} AND entered < ?)", clock - longest)  # noqa: S608 - our own names
+            self._delete(f"DELETE FROM {table} WHERE {column} < ?", first(clock - longest))  # noqa: S608 - our own names
+        self._delete(f"DELETE FROM state WHERE sequence < ({LAST_STATE} AND entered < ?)", first(clock - longest))  # noqa: S608 - our own names
 
     def by_size(self, now: float) -> None:
         """Delete the oldest details, then the oldest rest, until the size is within its bound."""
         if not self._is_too_large():
             return
-        self._delete("DELETE FROM sample WHERE time > ?", now + MAX_AHEAD)
+        self._delete("DELETE FROM sample WHERE time > ?", self.labels.first(now + MAX_AHEAD))
         steps = (
-            partial(self._delete_details, MIN_REPORTS, now - HOUR),
+            partial(self._delete_details, MIN_REPORTS, self.labels.first(now - HOUR)),
             partial(self._delete_samples, MINUTE),
             partial(self._delete_details, 1, math.inf),
             self._delete_rest,
@@ -220,6 +222,7 @@ class HistoryWriter(WriterThread):
         self._pruned_at, self._read_error = 0.0, ""
         self.description = ""
         """As :func:`otolith.storage.history.describe_machine` returns it; it is written with the next report."""
+        self.labels = TimeLabels()  # Of service times; they are written with the next report
         self.dropped = 0  # Reports that were not written
 
     def open(self, now: float) -> tuple[Numbers, str]:
@@ -295,6 +298,7 @@ class HistoryWriter(WriterThread):
         if self._connection is None:
             self._open()
         self._limit_log()
+        self._retention.labels = self.labels
         try:
             self._write_waiting()
         except sqlite3.Error as error:
@@ -321,6 +325,7 @@ class HistoryWriter(WriterThread):
             try:
                 with self._connection:
                     self._tables.describe(self.description)
+                    self._tables.label(self.labels)
                     for document in batch:
                         self._tables.add(document)
             except BaseException:

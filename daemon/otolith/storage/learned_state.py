@@ -8,10 +8,10 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
@@ -26,6 +26,7 @@ from otolith.estimation.information import MAX_TREND
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem, augment, indices
 from otolith.health.events import HealthState
+from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import is_plausible
 from otolith.health.status import PreviousStatus
 from otolith.twin.components import FAMILY_NAMES, MAX_COMPONENTS, sites, sources
@@ -71,8 +72,24 @@ class FilterRecord(StrictModel):
     noisier_since: float | None
 
 
+class SavedClock(StrictModel):
+    """The clock of a daemon: how its service time goes on in the next one, see :mod:`otolith.runtime.clock`."""
+
+    boot: str  # Identifies the boot of the computer; empty if unknown
+    offset: float  # Service time minus the time since that boot, s
+    begin: float  # Service time from which on the wall clock is that of this boot
+    labels: TimeLabels = Field(default_factory=TimeLabels)
+
+    @field_validator("labels")
+    @classmethod
+    def _rise(cls, labels: TimeLabels) -> TimeLabels:
+        if not labels.is_plausible:
+            raise ValueError("the begins of the labels do not rise")
+        return labels
+
+
 class LearnedState(StrictModel):
-    """What was learned of one machine."""
+    """What was learned of one machine. Times are service times."""
 
     version: int = VERSION
     machine: str = ""
@@ -85,7 +102,19 @@ class LearnedState(StrictModel):
     components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
     health: HealthState = Field(default_factory=HealthState)
     """Open events and states, so that a restart neither repeats nor drops them."""
+    clock: SavedClock | None = None  # None in older files, whose times are Unix times
     filter: FilterRecord | None = None  # None in files of version 1, and where nothing but components is to be kept
+
+    @model_validator(mode="before")
+    @classmethod
+    def _join_histories(cls, content: Any) -> Any:
+        """Join the histories that older files kept apart from before their clock was set back."""
+        health = content.get("health") if isinstance(content, dict) else None
+        if not isinstance(health, dict) or not isinstance(earlier := health.get("earlier"), dict):
+            return content
+        kept = {name: item[-1] for name, item in earlier.items() if isinstance(item, list | tuple) and item}
+        rest = {key: item for key, item in health.items() if key != "earlier"}
+        return {**content, "health": {**rest, "histories": {**rest.get("histories", {}), **kept}}}
 
 
 def check_version(text: str, newest: int) -> None:
@@ -118,9 +147,9 @@ def _hash(content: list[object]) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def learned_state(state: AdaptationState, signal_fingerprint: str) -> LearnedState:
+def learned_state(state: AdaptationState, signal_fingerprint: str, clock: SavedClock | None = None) -> LearnedState:
     """Return what is to be saved of ``state``; raise ValueError if it would not be restored."""
-    base, end = state.problem.base_model, state.posterior.belief.end
+    base = state.problem.base_model
     document = LearnedState(
         machine=state.machine,
         site=state.site,
@@ -131,9 +160,10 @@ def learned_state(state: AdaptationState, signal_fingerprint: str) -> LearnedSta
         resets=dict(state.resets),
         components=component_records(state),
         health=state.health,
-        filter=_filter_record(state) if np.isfinite(end) else None,
+        clock=clock,
+        filter=_filter_record(state) if np.isfinite(state.posterior.belief.end) else None,
     )
-    restored(document, cleared(state), end)
+    restored(document, cleared(state))
     return document
 
 
@@ -162,19 +192,14 @@ def _sums(state: AdaptationState, free: int) -> tuple[tuple[float, ...], ...]:
     return () if sums is None or sums.shape[1] != free else tuple(map(tuple, sums.tolist()))
 
 
-def restored(document: LearnedState, state: AdaptationState, now: float) -> AdaptationState:
+def restored(document: LearnedState, state: AdaptationState) -> AdaptationState:
     """Return the initial ``state`` with what was saved; its variance grows with the next window by the time since.
-
-    If the last window ends after ``now`` (Unix s), the clock was set back. The time since is unknown then, and counts
-    as the difference.
 
     Raises:
         ValueError: the document is not plausible.
     """
     _require(max(map(abs, _numbers(document.model_dump())), default=0.0) <= MAX_MAGNITUDE, "a number is too large")
-    earlier = [history for _, history in document.health.earlier.values()]
-    histories = [*document.health.histories.values(), *earlier]
-    _require(all(map(is_plausible, histories)) and all(earlier), "health: a history is not plausible")
+    _require(all(map(is_plausible, document.health.histories.values())), "health: a history is not plausible")
     health = replace(document.health, forecasts={})  # their limits may have changed
     record, problem = document.filter, state.problem
     check_components(document.components, problem.base_model)
@@ -193,8 +218,6 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
     _require(set(record.changing) <= {source.name for source in problem.base_model.inputs}, "changing: no inputs")
     problem = replace(problem, changing=record.changing)
     posterior, window = _posterior(record, problem), problem.window
-    if record.end > now:
-        posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
     kept = {name: getattr(record, name) for name in SCALARS}
     if not window.shortest <= record.records <= window.longest:
         kept["records"] = state.records

@@ -6,6 +6,7 @@ Each file has one writer: the daemon writes the learned state under a lock, the 
 import contextlib
 import fcntl
 import logging
+import math
 import os
 from collections import deque
 from collections.abc import Iterator
@@ -17,12 +18,14 @@ from typing import TypeVar
 from pydantic import Field
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import Baseline, History
 from otolith.machine import LoadedMachine
 from otolith.storage.disk import WriterThread, give_to, opened_folder, reason_of, replace_file
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
+    SavedClock,
     check_components,
     check_version,
     configuration_fingerprint,
@@ -82,6 +85,8 @@ class StateStore:
         self._lock: int | None = None
         self._is_late = False  # Whether the lock could not be taken at the start
         self._is_blocked = False
+        self.clock: SavedClock | None = None
+        """Of the times in the states that are saved; None for Unix times."""
 
     def lock(self) -> None:
         """Take the lock until :meth:`unlock` or the end, again if its file was removed.
@@ -168,6 +173,23 @@ class StateStore:
         learned = self._learned()
         return {} if learned is None else dict(learned.health.histories)
 
+    def labels(self) -> TimeLabels:
+        """Return the Unix times of the times in the saved state."""
+        clock, _ = self.saved_clock()
+        return TimeLabels() if clock is None else clock.labels
+
+    def saved_clock(self) -> tuple[SavedClock | None, float]:
+        """Return the clock of the saved state, and the service time at which its last window ends, s.
+
+        Without a state of this machine that can be read these are None and minus infinity.
+        """
+        for path in (self.components_path, self.earlier_path):
+            with contextlib.suppress(OtolithError):
+                learned = _read(path, LearnedState, VERSION)
+                if learned is not None and not self._other_origin(learned):
+                    return learned.clock, -math.inf if learned.filter is None else learned.filter.end
+        return None, -math.inf
+
     def _learned(self) -> LearnedState | None:
         try:
             learned = _read(self.components_path, LearnedState, VERSION)
@@ -191,13 +213,13 @@ class StateStore:
             return "[signals] have changed since it was saved"
         return ""
 
-    def restore(self, state: AdaptationState, now: float) -> tuple[AdaptationState, str]:
+    def restore(self, state: AdaptationState) -> tuple[AdaptationState, str]:
         """Return the initial ``state`` with what was saved, and why not all of it was used; empty if it was.
 
         A file that is not used as a whole is kept under another name. If it is damaged, what was saved before it is
-        used. Events of a state that is not used are dropped. Requires the lock; ``now`` in Unix s.
+        used. Events of a state that is not used are dropped. Requires the lock.
         """
-        warm, reason, is_damaged = self._restored(state, now)
+        warm, reason, is_damaged = self._restored(state)
         if not reason:
             return warm, ""
         note = f"{self.components_path}: {'only components are used' if warm.adopted else 'not used'}: {reason}"
@@ -212,10 +234,10 @@ class StateStore:
         except OSError as error:
             return warm, f"{note}; {self.earlier_path}: cannot be renamed: {error.strerror}"
         saved = datetime.fromtimestamp(self.components_path.stat().st_mtime, UTC)
-        warm, other = self.restore(state, now)
+        warm, other = self.restore(state)
         return warm, f"{note}; {other or f'used is what was saved before it, at {saved:%F %T} UTC'}"
 
-    def _restored(self, state: AdaptationState, now: float) -> tuple[AdaptationState, str, bool]:
+    def _restored(self, state: AdaptationState) -> tuple[AdaptationState, str, bool]:
         """Return the state with what was saved, why not all of it is used, and whether the file is damaged."""
         try:
             learned = _read(self.components_path, LearnedState, VERSION)
@@ -230,7 +252,7 @@ class StateStore:
             if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
                 reason = "parameters or noise in the machine file have changed since it was saved"
                 learned = learned.model_copy(update={"filter": None})
-            return restored(learned, state, now), reason, False
+            return restored(learned, state), reason, False
         except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
             reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
             return state, reason, True
@@ -258,7 +280,7 @@ class StateStore:
             ServiceError: the file cannot be written, another process has the lock, or the state is not plausible.
         """
         try:
-            learned = learned_state(state, self._signal_fingerprint)
+            learned = learned_state(state, self._signal_fingerprint, self.clock)
         except (ValueError, ArithmeticError, LookupError) as error:
             raise ServiceError(f"{self.components_path}: kept as it was: {reason_of(error)}") from error
         self._write_learned(learned)

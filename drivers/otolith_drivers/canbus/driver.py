@@ -22,6 +22,7 @@ from otolith_drivers.canbus.bus import (
 )
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CanSource, FrameOptions
+from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
@@ -32,7 +33,6 @@ MAX_STAMP_AGE = 1.0  # s; an older kernel stamp is from before the wall clock wa
 CLOCK_CHECK_PERIOD = 0.05  # s; how long a wall clock that was set can falsify times
 GATHERING_TIME = 0.002  # s; frames of a busy bus are received together, so that not each of them wakes the thread
 MIN_GATHERED, MAX_GATHERED = 4, 1000  # frames in that time on a busy bus; frames that are received together
-CLOCK_TRIES, CLOCK_PRECISION = 5, 2e-5  # s; readings of the clocks, and when one is good enough
 SILENT_PERIODS, MIN_SILENCE, MAX_SILENCE = 10.0, 2.0, 60.0  # periods; s; s: when a silent bus is opened anew
 UNKNOWN_PERIOD_SILENCE = 10.0  # s; the same while no period is known
 
@@ -209,18 +209,6 @@ class CanReceiver(ThreadedDriver):
                 failure = f"CAN bus {self._options.title()}: {cause}"
             self._connection.stay_down(failure)
         return None
-
-
-def wall_clock_offset() -> float:
-    """Wall clock minus monotonic clock (s): the best of several readings, since a thread may be held up in one."""
-    best, precision = 0.0, float("inf")
-    for _ in range(CLOCK_TRIES):
-        before, wall, after = time.monotonic(), time.time(), time.monotonic()
-        if after - before < precision:
-            best, precision = wall - 0.5 * (before + after), after - before
-        if precision < CLOCK_PRECISION:
-            break
-    return best
 
 
 def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:

@@ -19,6 +19,7 @@ from typing import Any
 from asyncua import Client, ua
 
 from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.message_times import ExchangeClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver
 from otolith_drivers.errors import counted
@@ -234,7 +235,7 @@ class OpcuaSubscriber(ThreadedDriver):
             lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
         plan = ""
         if readings.clock.known:
-            ahead = now - time.time() - readings.clock.offset
+            ahead = -wall_clock_offset() - readings.clock.offset
             where = "ahead of" if ahead > 0.0 else "behind"
             bound = f"{1e3 * readings.clock.error:.2g} ms"
             plan = f"the server's clock is {abs(ahead):.4g} s {where} this computer's, known within {bound}"

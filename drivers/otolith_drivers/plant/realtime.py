@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.reconnection import ThreadedDriver
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, ServiceError, nearest
@@ -189,7 +190,7 @@ class TruthFile:
         truth = scheduled.sample.truth
         if scheduled.index == 0:
             self._writer.writerow(["t", *truth])
-        unix = time.time() - time.monotonic() + scheduled.taken
+        unix = wall_clock_offset() + scheduled.taken
         self._writer.writerow([f"{unix:.4f}", *(f"{value:.9g}" for value in truth.values())])
 
     def close(self) -> None:

@@ -77,7 +77,7 @@ def cut_live(frames: list[can.Message]) -> list[Window]:
         del samples[:arrived]
         if windower.begin(rings, now, now - BEGUN):
             while windower.due(rings, now):
-                windows.append(windower.cut(rings, unix_offset=0.0))
+                windows.append(windower.cut(rings, offset=0.0))
         now += 0.004
     return windows
 

@@ -63,8 +63,9 @@ def list_(file: Path, as_json: bool) -> None:
         keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
         click.echo(json.dumps({"components": rows, **keys}, ensure_ascii=False))
         return
+    labels = store.labels()
     for record in records:
-        onset = record.adopted.onset
+        onset = labels.unix(record.adopted.onset)
         decision = _decision(record, decisions)
         click.echo(f"{_key(record)}  {_equation(machine, record)}  since {local_time(onset)}  {decision}")
     for key in sorted(decisions.rejected - {_key(record) for record in records}):
@@ -352,8 +353,8 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
         raise ConfigurationError(f"{machine.path}: no baseline: {needed}")
     store.save_decisions(replace(store.decisions(), baselines={**store.decisions().baselines, **kept}))
     for name, item in kept.items():
-        text = interval_text(item.value, item.sd, limited[name].unit)
-        click.echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(item.end)}", err=True)
+        text, end = interval_text(item.value, item.sd, limited[name].unit), store.labels().unix(item.end)
+        click.echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}", err=True)
         level, limit = limited[name].level(item.value, item.sd, Level.OK)
         if limit is not None:
             beyond = f"{level} {limit.side} {number_text(limit.value)} {unit_text(limited[name].unit)}"

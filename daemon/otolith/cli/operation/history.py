@@ -417,10 +417,15 @@ def reproduce(bundle: Path, as_json: bool) -> int:
         click.echo(printable(line), err=as_json)
 
     read = read_bundle(bundle)
-    state, count, span = read.state, len(read.windows), (read.windows[0].window.start, read.windows[-1].window.end)
-    echo(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(local_time, span))}")
+    state, count, last = read.state, len(read.windows), read.windows[-1].window
+
+    def when(time: float) -> str:
+        return local_time(time + last.ahead)
+
+    span = read.windows[0].window.start, last.end
+    echo(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(when, span))}")
     for event in read.events:
-        echo(f"{'' if event.end else f'{event.change}: '}{event_text(event, local_time)}")
+        echo(f"{'' if event.end else f'{event.change}: '}{event_text(event, when)}")
     echo(f"seed {state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
     with progress_line("reproducing") as show:
         difference = _first_difference(read, show, click.echo if as_json else lambda _: None)

@@ -1,0 +1,140 @@
+"""Unix times as labels: what the clock of the computer says about times that were measured on a steady clock.
+
+The core computes with *service time*, which only elapses: it never leaps, whatever sets the clock. A report leaves the
+daemon with Unix times. If the clock turns out to have been wrong, the labels change, and service times stay.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
+
+from otolith.health.limits import Level
+from otolith.health.observations import CLOCK
+from otolith.health.schema import (
+    EventChange,
+    EventDocument,
+    EvidenceDocument,
+    ForecastDocument,
+    HealthDocument,
+    Language,
+    ReportDocument,
+)
+from otolith.health.text import texts_in
+from otolith_drivers.config_files import DocumentModel
+
+# Thresholds: docs/reference/thresholds-health.md has the origin of each.
+MAX_SPANS = 200  # of different labels; of more, the two neighbours that differ least become one
+
+Document = TypeVar("Document", bound=DocumentModel)
+Span = tuple[float, float]  # Service time at which it begins, s, and Unix time minus service time from there on, s
+
+
+@dataclass(frozen=True, slots=True)
+class TimeLabels:
+    """The Unix times of service times. Before the first span, both are the same."""
+
+    spans: tuple[Span, ...] = ()  # Their begins rise
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the begins of the spans rise."""
+        begins = [begin for begin, _ in self.spans]
+        return len(begins) <= MAX_SPANS and all(before < after for before, after in pairwise(begins))
+
+    def ahead(self, time: float) -> float:
+        """Return the Unix time of a service time minus that time, s."""
+        at = bisect_right(self.spans, time, key=lambda span: span[0])
+        return self.spans[at - 1][1] if at else 0.0
+
+    def unix(self, time: float) -> float:
+        """Return the Unix time of a service time, s."""
+        return time + self.ahead(time)
+
+    def first(self, unix: float) -> float:
+        """Return the earliest service time from which a Unix time of ``unix`` or later is its label."""
+        reached = (max(begin, unix - ahead) for begin, end, ahead in self._pieces() if unix - ahead < end)
+        return min(reached)
+
+    def last(self, unix: float) -> float:
+        """Return the latest service time up to which a Unix time of ``unix`` or earlier is its label."""
+        reached = (min(end, unix - ahead) for begin, end, ahead in self._pieces() if unix - ahead >= begin)
+        return max(reached)
+
+    def _pieces(self) -> list[tuple[float, float, float]]:
+        """Return begin and end of each stretch of time with one label, and the Unix time minus the service time."""
+        infinity = float("inf")
+        spans = [(-infinity, 0.0), *self.spans, (infinity, 0.0)]
+        return [(begin, end, ahead) for (begin, ahead), (end, _) in pairwise(spans) if begin < end]
+
+    def since(self, time: float, ahead: float) -> "TimeLabels":
+        """Return labels that are ``ahead`` s ahead from a service time on."""
+        kept = [span for span in self.spans if span[0] < time]
+        return TimeLabels(_bounded([*kept, (time, ahead)]))
+
+    def shifted(self, since: float, by: float) -> "TimeLabels":
+        """Return labels that are ``by`` s later from the service time ``since`` on, and those before as they are."""
+        kept = [span for span in self.spans if span[0] < since]
+        later = [(begin, ahead + by) for begin, ahead in self.spans if begin >= since]
+        if not later or later[0][0] > since:
+            later.insert(0, (since, self.ahead(since) + by))
+        return TimeLabels(_bounded([*kept, *later]))
+
+    def of_event(self, event: EventDocument) -> EventDocument:
+        """Return an event with Unix times instead of service times."""
+        return _labelled(self, event, "start", "since", "end")
+
+    def of_report(self, report: ReportDocument) -> ReportDocument:
+        """Return a report with Unix times instead of service times."""
+        if not self.spans:
+            return report
+        parameters = {
+            name: item if item.forecast is None else item.model_copy(update={"forecast": self._forecast(item.forecast)})
+            for name, item in report.parameters.items()
+        }
+        update = {
+            "window": _labelled(self, report.window, "start", "end"),
+            "parameters": parameters,
+            "components": tuple(_labelled(self, item, "onset") for item in report.components),
+            "findings": tuple(_labelled(self, item, "since") for item in report.findings),
+            "events": tuple(map(self.of_event, report.events)),
+            "health": report.health and self._health(report.health),
+        }
+        return report.model_copy(update=update)
+
+    def _health(self, health: HealthDocument) -> HealthDocument:
+        parts = {name: _labelled(self, part, "since") for name, part in health.parts.items()}
+        return _labelled(self, health, "since").model_copy(update={"parts": parts})
+
+    def _forecast(self, forecast: ForecastDocument) -> ForecastDocument:
+        crossings = {
+            name: _labelled(self, crossing, "at", "low", "high")
+            for name in ("watch", "act")
+            if (crossing := getattr(forecast, name)) is not None
+        }
+        return _labelled(self, forecast, "computed").model_copy(update=crossings)
+
+
+def _labelled(labels: TimeLabels, document: Document, *names: str) -> Document:
+    """Return a document whose keys ``names`` have Unix times."""
+    times = {name: getattr(document, name) for name in names}
+    return document.model_copy(update={name: labels.unix(time) for name, time in times.items() if time is not None})
+
+
+def _bounded(spans: list[Span]) -> tuple[Span, ...]:
+    """Return spans without those that change nothing, and at most :data:`MAX_SPANS`."""
+    distinct = [span for before, span in pairwise([(0.0, 0.0), *spans]) if span[1] != before[1]]
+    while len(distinct) > MAX_SPANS:
+        changes = [abs(after[1] - before[1]) for before, after in pairwise(distinct)]
+        del distinct[1 + changes.index(min(changes))]
+    return tuple(distinct)
+
+
+def clock_event(time: float, by: float, window: int, language: Language) -> EventDocument:
+    """Return the event that the clock was set ``by`` s, at a service time, before the window with this index."""
+    text = texts_in(language)("clock_set", by=f"{by:+.0f}")
+    return EventDocument(
+        id=f"{CLOCK}@{time:.1f}", part=CLOCK, state=Level.OK, change=EventChange.NOTED,
+        start=time, since=time, end=time, condition=text, condition_id=CLOCK, text=text, language=language,
+        evidence=EvidenceDocument(windows=(window, window), value=by, unit="s"),
+    )  # fmt: skip
