@@ -2,8 +2,10 @@
 
 import os
 import signal
+import struct
 import threading
 import time
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -148,3 +150,63 @@ def test_a_file_that_is_gone_gives_one_line(capfd: pytest.CaptureFixture[str]) -
     wait_for(lambda: not child.alive)
     child.stop(PATIENCE)
     assert capfd.readouterr().err == "recorder: [Errno 2] No such file or directory: '/nowhere/folder'\n"
+
+
+def freeze_within_a_message(connection: Any) -> None:
+    """Main function of a child that sends a message, and stops in the middle of the next one."""
+    connection.send("whole")
+    os.write(connection.fileno(), struct.pack("!i", 1 << 20) + b"half")
+    time.sleep(60.0)
+
+
+@pytest.mark.timed
+def test_a_child_that_freezes_within_a_message_delays_nobody() -> None:
+    child = ChildProcess("frozen", "tests.runtime.test_process:freeze_within_a_message", room=1)
+    child.start()
+    replies: list[object] = []
+
+    def has_replied() -> bool:
+        wait(child.waitables, timeout=0.1)
+        replies.extend(child.replies())
+        return bool(replies)
+
+    wait_for(has_replied)
+    begun = time.monotonic()
+    for _ in range(3):
+        assert child.replies() == []
+    assert time.monotonic() - begun < within(0.5)
+    assert replies == ["whole"]
+    child.kill()
+    assert not child.alive
+
+
+def answer_and_end(connection: Any) -> None:
+    """Main function of a child that ends with its answer."""
+    connection.send(bytes(1 << 20))
+
+
+def test_what_a_child_sent_before_its_end_is_received() -> None:
+    child = ChildProcess("last words", "tests.runtime.test_process:answer_and_end", room=1)
+    child.start()
+    sizes: list[int] = []
+    while child.alive:
+        wait(child.waitables, timeout=0.1)
+        sizes += map(len, child.replies())
+    assert sizes == [1 << 20]
+    child.stop(0.0)
+
+
+def confuse(connection: Any) -> None:
+    """Main function of a child that sends what is no message."""
+    os.write(connection.fileno(), struct.pack("!i", 4) + b"what")
+    time.sleep(60.0)
+
+
+def test_what_is_no_message_ends_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    child = ChildProcess("confused", "tests.runtime.test_process:confuse", room=1)
+    child.start()
+    wait_for(lambda: child._inbox is not None and not child._inbox.is_open)
+    assert child.replies() == []
+    assert_each_says(caplog.messages, ("confused", "cannot be read"))
+    assert wait(child.waitables, timeout=0.05) == []  # nobody waits in vain for it
+    child.kill()

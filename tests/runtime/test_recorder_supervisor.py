@@ -5,6 +5,8 @@ import logging
 import os
 import shutil
 import signal
+import threading
+import time
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -13,12 +15,13 @@ from pathlib import Path
 import pytest
 
 from otolith.machine import LoadedMachine, load_machine
-from otolith.runtime.process import MIN_DEATHS, RECORDER_TIMEOUT, RecorderSupervisor
+from otolith.runtime.recorder_supervisor import FOLDER_TIMEOUT, MIN_DEATHS, RECORDER_TIMEOUT, RecorderSupervisor
+from otolith.storage.recording_files import RecordingFile, RecordingFolder
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.replay.recording import RecordingReader
 from tests.conftest import EXAMPLES
 from tests.publishing.test_recording_size import UNITS, noise
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE, wait_for, within
 
 Usage = namedtuple("Usage", ["total", "used", "free"])
 
@@ -40,9 +43,16 @@ def supervisor(machine: LoadedMachine) -> Iterator[RecorderSupervisor]:
 def answered(supervisor: RecorderSupervisor, now: float) -> Callable[[], bool]:
     def is_answered() -> bool:
         supervisor.poll(now)
-        return supervisor._unanswered == 0
+        return supervisor._preparation is None and supervisor._unanswered == 0
 
     return is_answered
+
+
+def poll(supervisor: RecorderSupervisor, now: float) -> None:
+    """Poll until the disk has answered."""
+    supervisor.poll(now)
+    wait_for(lambda: supervisor._preparation is None or supervisor._preparation.is_done)
+    supervisor.poll(now)
 
 
 def test_a_stopped_recorder_is_killed_and_counted(
@@ -58,7 +68,7 @@ def test_a_stopped_recorder_is_killed_and_counted(
         supervisor.offer(one, 100.0 + 2.0 * index)
     supervisor.poll(100.0 + RECORDER_TIMEOUT)
     assert (supervisor.restarts, supervisor.dropped) == (0, 0)
-    supervisor.poll(100.1 + RECORDER_TIMEOUT)
+    poll(supervisor, 100.1 + RECORDER_TIMEOUT)
     assert not Path(f"/proc/{stopped}").exists()
     assert (supervisor.restarts, supervisor.dropped) == (1, 4)  # one was received, but not yet written
     assert "the recorder has not answered for 60.1 s and is killed" in caplog.text
@@ -72,17 +82,18 @@ def test_a_stopped_recorder_is_killed_and_counted(
 
 def test_a_recorder_that_always_dies_has_an_outage(supervisor: RecorderSupervisor) -> None:
     supervisor.start(0.0)
+    poll(supervisor, 0.0)
     supervisor.offer(next(noise(1)), 1.0)
-    outages = list[str]()
-    for index in range(MIN_DEATHS + 1):
-        outages.append(supervisor.outage)
-        if supervisor._process.alive:
-            supervisor._process._process.kill()
-            supervisor._process._process.join()
-        supervisor.poll(now := 100.0 * index + 10.0)
-        outages.append(supervisor.outage)
-        supervisor.poll(now + 50.0)
-    assert [bool(outage) for outage in outages].index(True) >= 2 * MIN_DEATHS - 3
+    outages, now = list[str](), 2.0
+    for _ in range(MIN_DEATHS):
+        supervisor._process._process.kill()
+        supervisor._process._process.join()
+        wait_for(lambda: not supervisor._process.alive)
+        while not supervisor._process.alive:
+            outages.append(supervisor.outage)
+            poll(supervisor, now)
+            now += 0.25
+    assert outages[0] == ""
     assert "ended" in outages[-1]
 
 
@@ -107,15 +118,16 @@ def test_a_full_disk_gives_one_warning_and_one_line_when_it_has_room(
         supervisor.start(0.0)
         for minute in range(1440):
             free[0] = int(5e9 + (minute % 7 - 3) * 1e8)  # around the 5 % that are kept free
-            supervisor.poll(60.0 * minute)
+            poll(supervisor, 60.0 * minute)
             supervisor.offer(report, 60.0 * minute)
         (line,) = caplog.messages
         assert "recording pauses until" in line
         assert "MB more free" in line
         assert supervisor.dropped == 1440
+        assert "MB more free" in supervisor.outage
         assert not any((tmp_path / "recordings").iterdir())
         free[0] = 6 * 10**9
-        supervisor.poll(1e6)
+        poll(supervisor, 1e6)
     assert len(caplog.messages) == 2
     assert caplog.messages[1].startswith("recording to ")
     assert supervisor.restarts == 0
@@ -130,7 +142,7 @@ def test_a_folder_that_cannot_be_written_is_logged_once(
         RecorderSupervisor(machine, tmp_path / "recordings" / "own.rrd").start(0.0)
     supervisor.start(0.0)
     for minute in range(100):
-        supervisor.poll(60.0 * minute)
+        poll(supervisor, 60.0 * minute)
     (line,) = caplog.messages
     assert line.startswith("no recording: ")
 
@@ -140,8 +152,9 @@ def test_a_link_to_itself_among_the_recordings_is_left_alone(supervisor: Recorde
     link.parent.mkdir()
     link.symlink_to(link.name)
     supervisor.start(0.0)
+    poll(supervisor, 1.0)
     assert link.is_symlink()
-    assert supervisor._problem == ""
+    assert supervisor.outage == ""
 
 
 def test_a_disk_that_fails_costs_recordings_alone(
@@ -153,9 +166,52 @@ def test_a_disk_that_fails_costs_recordings_alone(
     monkeypatch.setattr(shutil, "disk_usage", fail)
     supervisor.start(0.0)
     for minute in range(100):
-        supervisor.poll(60.0 * minute)
+        poll(supervisor, 60.0 * minute)
     (line,) = caplog.messages
     assert line == "no recording: [Errno 5] Input/output error"
+
+
+@pytest.mark.timed
+def test_a_folder_that_does_not_answer_delays_nobody(
+    supervisor: RecorderSupervisor, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    answers = threading.Event()
+    files = RecordingFolder.files
+
+    def hang(folder: RecordingFolder) -> list[RecordingFile]:
+        assert answers.wait(PATIENCE)
+        return files(folder)
+
+    monkeypatch.setattr(RecordingFolder, "files", hang)
+    begun = time.monotonic()
+    supervisor.start(0.0)
+    for index, report in enumerate(noise(3)):
+        supervisor.offer(report, 2.0 * index)
+        supervisor.poll(2.0 * index)
+    assert time.monotonic() - begun < within(0.5)
+    assert supervisor.outage == ""
+    for _ in range(2):
+        supervisor.poll(1.0 + FOLDER_TIMEOUT)
+    assert "does not answer" in supervisor.outage
+    assert caplog.text.count("does not answer") == 1
+    assert supervisor.dropped == 3
+    answers.set()
+    poll(supervisor, 100.0)
+    assert supervisor.outage == ""
+
+
+def test_windows_that_come_before_the_folder_is_ready_are_recorded(
+    supervisor: RecorderSupervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers, files = threading.Event(), RecordingFolder.files
+    monkeypatch.setattr(RecordingFolder, "files", lambda folder: answers.wait(PATIENCE) and files(folder))
+    supervisor.start(0.0)
+    for report in noise(2):
+        supervisor.offer(report, 1.0)
+    answers.set()
+    poll(supervisor, 2.0)
+    wait_for(answered(supervisor, 3.0))
+    assert (supervisor.dropped, supervisor.restarts) == (0, 0)
 
 
 def test_a_file_is_never_larger_than_an_eighth_of_the_budget(machine: LoadedMachine) -> None:

@@ -221,6 +221,7 @@ class Demo:
         self._print("compiling the twin, which takes longer the first time ...")
         with self._console.status("compiling"):
             while compiler.alive and not stopped():
+                compiler.replies()
                 time.sleep(PAUSE)
         compiler.kill()
         if not stopped():

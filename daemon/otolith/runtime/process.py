@@ -1,15 +1,13 @@
-"""The processes that the daemon starts: children of its own, the recorder, and the command that runs for each event.
+"""The processes that the daemon starts: children of its own, and the command that runs for each event.
 
 A child may die at any moment without harm to the daemon. A child process is spawned, not forked, because a fork copies
-only part of the threads of Zenoh and Rerun. It communicates over one pipe, on which the daemon never waits, and ends by
-itself when the daemon has died. The recorder is supervised: restarted when it has died or hangs, and paused while the
-disk is full.
+only part of the threads of Zenoh and Rerun. It communicates over one pipe, on which only threads wait, and ends by
+itself when the daemon has died.
 """
 
 import contextlib
 import json
 import logging
-import math
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -19,19 +17,13 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import resource_tracker
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from otolith.health.schema import EventDocument, Report
-from otolith.storage.recording_files import DAY, GIGABYTE, MEGABYTE, RESUME_FACTOR, RecordingBudget, RecordingFolder
-from otolith_drivers.errors import OtolithError
-from otolith_drivers.user_dirs import writable
-
-if TYPE_CHECKING:  # each child imports this module
-    from otolith.machine import LoadedMachine
+from otolith.health.schema import EventDocument
 
 log = logging.getLogger(__name__)
 
@@ -42,12 +34,6 @@ KILL_WAIT = 1.0  # s for the kernel to end a killed process
 MAX_RUNNING = 2  # commands at a time
 MAX_WAITING_EVENTS = 64  # events that wait for a command; later ones are dropped and counted
 COMMAND_TIMEOUT = 30.0  # s until a command is killed with all processes of its session
-RECORDER_ROOM = 32  # windows that wait for the recorder
-RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
-RECORDER_TIMEOUT = 60.0  # s without an answer, while windows wait, after which the recorder hangs
-MIN_DEATHS = 4  # of the recorder in a row, from which it is out of order and not restarted by chance
-FORBIDDEN = {"0", "false", "off"}  # values of RERUN that switch its logging off
-MIN_FILES = 8  # files that the budget has room for at least
 PRIVATE_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")  # With them a command could notify systemd
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
@@ -68,6 +54,41 @@ def _send_queued(outbox: queue.Queue[Any], connection: multiprocessing.connectio
             connection.send(message := outbox.get())
 
 
+class _Inbox:
+    """What a child sends: a thread waits for its messages, of which a child that freezes may have sent one half."""
+
+    def __init__(self, name: str, connection: multiprocessing.connection.Connection) -> None:
+        """The thread closes ``connection`` once the child has closed the other end."""
+        self._messages: deque[Any] = deque()
+        self.ready, self._ready = multiprocessing.connection.Pipe(duplex=False)
+        """Readable as soon as there is a message, or the child has ended."""
+        self._thread = threading.Thread(target=self._receive, args=(name, connection), name=f"from-{name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a message, or may be one."""
+        return self._thread.is_alive() or bool(self._messages)
+
+    def take(self) -> list[Any]:
+        """Return the messages received since the last call, without waiting."""
+        with contextlib.suppress(EOFError):
+            while self.ready.poll():
+                self.ready.recv_bytes()
+        return [self._messages.popleft() for _ in range(len(self._messages))]
+
+    def _receive(self, name: str, connection: multiprocessing.connection.Connection) -> None:
+        with connection, self._ready:
+            try:
+                while True:
+                    self._messages.append(connection.recv())
+                    self._ready.send_bytes(b"")
+            except (EOFError, OSError):  # it has ended
+                return
+            except Exception as error:  # noqa: BLE001 - of a message that is none: whoever waits for it has a timeout
+                log.warning("%s: a message that cannot be read: %s", name, error)
+
+
 class ChildProcess:
     """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a child process.
 
@@ -82,7 +103,7 @@ class ChildProcess:
         self._started_at = 0.0
         self._restart_at: float | None = None
         self._process: Any = None
-        self._connection: Any = None
+        self._inbox: _Inbox | None = None
         self._outbox: queue.Queue[Any] = queue.Queue(room)
 
     def start(self, *arguments: Any) -> None:
@@ -98,30 +119,36 @@ class ChildProcess:
 
     def _spawn(self, arguments: Sequence[Any]) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
+        ours, theirs = context.Pipe()
         try:
             self._outbox = queue.Queue(self._room)
             process = context.Process(
                 target=_run_main, args=(theirs, self._main, arguments), name=self.name, daemon=True
             )
             resource_tracker.ensure_running()  # its start unblocks signals, so it must be running before the block
-            # Its own descriptor for the thread: the next pipe gets the number, and the write, of one that is closed.
-            sending = self._outbox, multiprocessing.connection.Connection(os.dup(self._connection.fileno()))
+            # Each thread has its own descriptor: the next pipe gets the number, and the write, of one that is closed.
+            sending = self._outbox, multiprocessing.connection.Connection(os.dup(ours.fileno()))
             # Child and thread inherit the mask: only the main thread handles a signal to the whole process group.
             unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
                 process.start()
                 self._process = process
                 threading.Thread(target=_send_queued, args=sending, name=f"to-{self.name}", daemon=True).start()
+                self._inbox = _Inbox(self.name, ours)
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+        except BaseException:
+            ours.close()
+            raise
         finally:
             theirs.close()
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process is not None and self._process.is_alive()
+        """Whether the process runs, or has ended and left messages."""
+        if self._process is None:
+            return False
+        return self._process.is_alive() or (self._inbox is not None and self._inbox.is_open)
 
     @property
     def deaths(self) -> int:
@@ -136,7 +163,12 @@ class ChildProcess:
     @property
     def waitables(self) -> list[Any]:
         """Arguments for :func:`multiprocessing.connection.wait`: ready on a reply, and when the process has died."""
-        return [self._connection, self._process.sentinel] if self.alive else []
+        if not self.alive:
+            return []
+        inbox = (
+            [] if self._inbox is None or not self._inbox.is_open else [self._inbox.ready]
+        )  # it stays ready at the end
+        return [self._process.sentinel, *inbox]
 
     def may_restart(self, now: float) -> bool:
         """Return whether the process is dead and its restart pause is over; ``now`` is monotonic time, s."""
@@ -168,12 +200,8 @@ class ChildProcess:
         return True
 
     def replies(self) -> list[Any]:
-        """Return the messages received since the last call; wait only for the rest of a message that has begun."""
-        messages = []
-        with contextlib.suppress(EOFError, OSError):
-            while self._connection is not None and self._connection.poll():
-                messages.append(self._connection.recv())
-        return messages
+        """Return the messages received since the last call, without waiting."""
+        return [] if self._inbox is None else self._inbox.take()
 
     def kill(self) -> None:
         """Kill the process."""
@@ -190,13 +218,13 @@ class ChildProcess:
         self.kill()
 
     def _release(self) -> None:
-        if self._connection is not None:
-            self.offer(None)  # ends the sending thread
-            self._connection.close()
         if self._process is not None:
+            self.offer(None)  # ends the sending thread
             with contextlib.suppress(ValueError):
                 self._process.close()
-        self._process = self._connection = None
+        if self._inbox is not None:
+            self._inbox.ready.close()
+        self._process = self._inbox = None
 
 
 class EventCommand:
@@ -292,130 +320,3 @@ def _kill_session(process: "subprocess.Popen[bytes]") -> None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-class RecorderSupervisor:
-    """The recorder of one machine. Times are monotonic, s."""
-
-    def __init__(self, machine: "LoadedMachine", path: Path | None = None) -> None:
-        """The first recording is ``path`` instead of files in the folder of the machine."""
-        self._machine, self._path = machine, path
-        self._process = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
-        self._unanswered = self._unwritten = 0
-        self._planned_starts = 1
-        self._progress_at = 0.0
-        self._problem = ""
-        self._first: tuple[object, ...] | None = None  # arguments of the process, until it is spawned
-        self.dropped = 0  # Windows that were not recorded
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether the machine file wants recordings, and Rerun's variable of the environment does not forbid them."""
-        return self._machine.file.recording.enabled and os.environ.get("RERUN", "").lower() not in FORBIDDEN
-
-    @property
-    def outage(self) -> str:
-        """Why nothing is recorded; empty if something is, or should not be."""
-        if not self.is_enabled or self._process.alive or self._first is not None:
-            return ""
-        ended = f"the recorder has ended {self._process.deaths} times" if self._process.deaths >= MIN_DEATHS else ""
-        return self._problem or ended
-
-    @property
-    def restarts(self) -> int:
-        """How often the recorder was started again."""
-        return max(0, self._process.starts - self._planned_starts)
-
-    def start(self, now: float) -> None:
-        """Start the recorder with a new file, if the disk has room; raise ServiceError for a file the caller named.
-
-        The first process is spawned for the first window: it would take time from the worker, which starts as well.
-        A folder that refuses is logged and tried again: monitoring goes on without recordings.
-        """
-        try:
-            self._start(now)
-        except (OtolithError, OSError) as error:
-            if self._path is not None and not self._process.starts:
-                raise
-            self._pause(f"no recording: {error}")
-
-    def _start(self, now: float) -> None:
-        path, folder = self._path, None
-        if path is None or self._process.starts:  # a restarted recorder must not overwrite its first file
-            folder = self._folder()
-            path = folder.new_path(time.time())
-            is_first = not self._process.starts and not self._problem
-            missing = folder.make_room(time.time(), factor=1.0 if is_first else RESUME_FACTOR)
-            if missing > 0:
-                self._pause(f"recording pauses until {path.parent} has {math.ceil(missing / 1e6)} MB more free")
-                return
-        writable(path.parent)
-        arguments = (path, self._machine.recorded(self._machine.driver.sampling), folder)
-        if self._process.starts:
-            self._process.start(*arguments)
-        else:
-            self._first = arguments
-        self._progress_at, self._problem = now, ""
-        log.info("recording to %s", path)
-
-    def reload(self, machine: "LoadedMachine", now: float, seconds: float) -> None:
-        """Go on with a new file and the changed machine file; the old one is finished in up to ``seconds``."""
-        self._process.stop(seconds)
-        self._unanswered = self._unwritten = 0
-        self._machine, self._first = machine, None
-        if self.is_enabled:
-            self._planned_starts += self._process.starts >= self._planned_starts
-            self.start(now)
-
-    def _folder(self) -> RecordingFolder:
-        identity, table = self._machine.file.machine, self._machine.file.recording
-        largest = table.max_gigabytes * GIGABYTE
-        budget = RecordingBudget(
-            max_bytes=largest,
-            max_age=table.max_days * DAY,
-            rotate_bytes=min(table.rotate_megabytes * MEGABYTE, largest / MIN_FILES),
-            rotate_age=table.rotate_minutes * 60.0,
-        )
-        key = f"{identity.site}.{identity.name}"
-        return RecordingFolder(self._machine.recording_folder, key, budget, set_mode=table.folder is None)
-
-    def offer(self, report: Report, now: float) -> None:
-        """Give the recorder a window, without waiting."""
-        if self._first is not None:
-            self._process.start(*self._first)
-            self._first = None
-        if not (self._process.alive and self._process.offer(report)):
-            self.dropped += 1
-            return
-        if not self._unanswered:
-            self._progress_at = now
-        self._unanswered += 1
-
-    def poll(self, now: float) -> None:
-        """Read answers, kill a recorder that hangs, and restart one that has ended."""
-        if self._first is not None:
-            return
-        for waiting in self._process.replies():
-            self._unanswered, self._unwritten, self._progress_at = max(0, self._unanswered - 1), waiting, now
-        if self._process.alive and self._unanswered and now - self._progress_at > RECORDER_TIMEOUT:
-            log.warning("the recorder has not answered for %g s and is killed", now - self._progress_at)
-            self._process.kill()
-        if self._process.alive:
-            if self._process.age > RECORDER_HEALTHY_AGE:
-                self._process.reset_backoff()
-            return
-        self.dropped += self._unanswered + self._unwritten
-        self._unanswered = self._unwritten = 0
-        if self._process.may_restart(now):
-            self.start(now)
-
-    def stop(self, seconds: float) -> None:
-        """Let the recorder write what it has for up to ``seconds``."""
-        self._process.stop(seconds)
-
-    def _pause(self, problem: str) -> None:
-        """Wait for the restart pause; a problem that continues is logged once."""
-        if not self._problem:
-            log.warning("%s", problem)
-        self._problem = problem
-        self._process.count_failed_start()

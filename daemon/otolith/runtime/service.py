@@ -37,7 +37,8 @@ from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import protect_files
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
-from otolith.runtime.process import SIGNALS, EventCommand, RecorderSupervisor
+from otolith.runtime.process import SIGNALS, EventCommand
+from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
