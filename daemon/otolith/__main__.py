@@ -35,27 +35,29 @@ def main() -> None:
 
     from otolith.cli.common import INTERRUPTED  # noqa: PLC0415
     from otolith.cli.main import cli  # noqa: PLC0415
+    from otolith.cli.terminal import echo, echo_traceback  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
     codecs.register_error("otolith", written_plainly)
+    sys.excepthook = echo_traceback
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that has no 'Ω' gets 'ohm'
             stream.reconfigure(errors="otolith")
     try:
         code = cli.main(prog_name="otolith", standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        error.show(shown := io.StringIO())
+        echo(*shown.getvalue().rstrip("\n").split("\n"), err=True)
         code = error.exit_code
     except OtolithError as error:
-        for line in str(error).splitlines():
-            click.echo(f"Error: {line}", err=True)
+        echo(*(f"Error: {line}" for line in str(error).split("\n")), err=True)
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
     except OSError as error:  # such as a full disk or a file that was removed: a traceback would explain nothing
         place = error.filename or "a file of this command, or its standard output"
         remedy = ": free space on its disk, then repeat the command" if error.errno == errno.ENOSPC else ""
-        click.echo(f"Error: {place}: {error.strerror or error}{remedy}", err=True)
+        echo(f"Error: {place}: {error.strerror or error}{remedy}", err=True)
         code = 2
     sys.exit(code or 0)
 

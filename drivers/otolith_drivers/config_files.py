@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic_core import PydanticSerializationError
 
 from otolith_drivers.errors import ConfigurationError, nearest, shown
+from otolith_drivers.grammars.json_lines import escaped, json_text
 from otolith_drivers.outside_text import visible
 from otolith_drivers.toml_bounds import MAX_TEXT, depth_fault, text_faults
 
@@ -75,6 +77,13 @@ class DocumentModel(BaseModel):
     """A document: unknown keys are errors, values are finite and immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def json_line(self) -> str:
+        """Return the document as one line of JSON, without absent keys."""
+        try:
+            return escaped(self.model_dump_json(exclude_none=True))
+        except PydanticSerializationError:  # a text with half a character, such as the name of a file
+            return json_text(self.model_dump(mode="python", exclude_none=True))
 
 
 class StrictModel(DocumentModel):

@@ -17,6 +17,9 @@ CONTROL = re.compile(
 )
 """A character that is not shown as itself. Source: the categories Cc, Cf, Cs, Zl and Zp of Unicode."""
 
+SURROGATE = re.compile("[\ud800-\udfff]")
+"""Half a character, as JSON and the names of files may have: no encoding writes it."""
+
 
 def visible(text: str, limit: int | None = None) -> str:
     """Return ``text`` as one line with its controls escaped; of more than ``limit`` characters only the first."""

@@ -14,7 +14,7 @@ SOURCES = {
     "cli": [DAEMON / "cli", DAEMON / "cli" / "commissioning", DAEMON / "cli" / "operation", DAEMON / "health"],
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
-    "drivers": [DRIVERS, DRIVERS / "common"],
+    "drivers": [DRIVERS, DRIVERS / "common", DRIVERS / "grammars"],
     "estimation": [DAEMON / "estimation"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],

@@ -30,7 +30,7 @@ def test_every_notification_arrives_with_one_line_per_assignment(manager: socket
     notifier.close()
     received = [manager.recv(4096).decode() for _ in range(3)]
     assert received == [
-        f"READY=1\nSTATUS=listening: CAN\nMAINPID={os.getpid()}",
+        f"READY=1\nSTATUS=listening:\\nCAN\nMAINPID={os.getpid()}",
         "STATUS=window 3 good",
         "WATCHDOG=1",
     ]

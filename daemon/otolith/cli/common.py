@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 
+from otolith.cli.terminal import JournalFormatter, LogFormatter, echo
 from otolith_drivers.errors import ServiceError
 
 SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
@@ -77,33 +78,27 @@ def log_to_stderr(*, verbose: bool) -> None:
     """Log to standard error; under systemd with the priority prefix that journald reads."""
     handler = logging.StreamHandler(sys.stderr)
     if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
+        handler.setFormatter(JournalFormatter("%(name)s: %(message)s"))
     else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
+        handler.setFormatter(LogFormatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     for name in ("otolith", "otolith_drivers"):
         logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
-class _JournalFormatter(logging.Formatter):
-    PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
-
-    def format(self, record: logging.LogRecord) -> str:
-        priority = next(number for level, number in self.PRIORITIES if record.levelno >= level)
-        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
-
-
 @contextmanager
 def progress_line(first: str, *, enabled: bool = True) -> Iterator[Callable[[str], None]]:
     """A function that shows a text on a line of standard error, if that is a terminal and ``enabled``."""
-    from rich.console import Console
+    from rich.text import Text
 
-    console = Console(stderr=True)
+    from otolith.cli.console import Terminal
+
+    console = Terminal(stderr=True)
     console.quiet = not (enabled and console.is_terminal)
     if not console.quiet and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, _end_with_cursor)
-    with console.status(first) as status:
-        yield status.update
+    with console.status(Text(first)) as status:
+        yield lambda text: status.update(Text(text))
 
 
 def _end_with_cursor(number: int, _: FrameType | None) -> None:
@@ -126,8 +121,7 @@ def drain(texts: "queue.Queue[str]", timeout: float) -> list[str]:
 
 def echo_warnings(data: Path, lines: Iterable[str]) -> None:
     """Print what a replay of ``data`` warns of, to standard error."""
-    for line in lines:
-        click.echo(f"{data}: {line}", err=True)
+    echo(*(f"{data}: {line}" for line in lines), err=True)
 
 
 def local_time(seconds: float) -> str:

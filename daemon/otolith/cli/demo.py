@@ -5,7 +5,6 @@ The verdict compares what was injected into the simulated machine with what the 
 
 import contextlib
 import csv
-import json
 import os
 import queue
 import shlex
@@ -19,17 +18,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import initial_state
 from otolith.cli.common import DEMOS, INTERRUPTED, drain, local_time
+from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
+from otolith.cli.terminal import echo_json
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import announcements, event_text, headline, summary
+from otolith.health.text import announcements, event_text, headline, number_text, number_texts, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -40,7 +40,7 @@ from otolith.storage.recording_files import STAMP
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
-from otolith_drivers.units import equation_text, quantity_text, scale_of
+from otolith_drivers.units import equation_text, unit_text
 from otolith_drivers.user_dirs import state_directory, writable
 
 # The verdict. Engineering choices; tests/system/test_main_job.py runs the demo and asserts the same TOLERANCE.
@@ -177,7 +177,7 @@ class Demo:
         stamp = begun.astimezone(UTC).strftime(STAMP)
         self._recording = self._folder / f"{names.site}.{names.name}-{stamp}-{os.getpid()}.rrd"
         self._history = path_in(self._folder / "history", names.site, names.name)
-        self._console = Console(stderr=as_json)
+        self._console = Terminal(stderr=as_json)
         self._reports: list[ReportDocument] = []
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -210,7 +210,7 @@ class Demo:
         return INTERRUPTED if stopped() else self._verdict()
 
     def _print(self, text: str, style: str = "") -> None:
-        self._console.print(text, style=style, markup=False, highlight=not style, soft_wrap=True)
+        self._console.print(text, style=style, highlight=not style, soft_wrap=True)
 
     def _compile(self, stopped: Callable[[], bool]) -> None:
         """Compile the twin before plant and daemon start: a daemon without a compiled twin misses windows."""
@@ -347,7 +347,7 @@ class Demo:
             ],
             "recording": str(self._recording),
         }
-        sys.stdout.write(json.dumps(verdict) + "\n")
+        echo_json(verdict)
 
     def _table(self, rows: list[Comparison]) -> Table:
         step = max(1, len(rows) // MAX_ROWS)
@@ -355,15 +355,15 @@ class Demo:
         table = Table(title=f"injected and estimated, good windows with excitation{every}")
         for column in ("window", "parameter", "injected", "estimated ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
-        units = {parameter.name: parameter.unit for parameter in self._machine.problem.free}
+        units = {parameter.name: unit_text(parameter.unit) for parameter in self._machine.problem.free}
         last = [] if (len(rows) - 1) % step == 0 else rows[-1:]
         for row in [*rows[::step], *last]:
-            text, error, style, scale = "unknown", "", None, scale_of(row.injected, units[row.parameter])
+            text, error, style = "unknown", "", None
             if row.estimated is not None:
-                text, error = " ± ".join(scale.numbers(row.estimated, QUANTILE * row.sd)), f"{row.error:.3%}"
+                text, error = " ± ".join(number_texts(row.estimated, QUANTILE * row.sd)), f"{row.error:.3%}"
                 style = "red" if row.wrong else None
-            injected = scale.number(row.injected)
-            table.add_row(str(row.window), row.parameter, injected, text, scale.unit, error, style=style)
+            injected, unit = number_text(row.injected), units[row.parameter]
+            table.add_row(str(row.window), row.parameter, injected, text, unit, error, style=style)
         return table
 
     def _print_changes(self, rows: list[Comparison]) -> None:
@@ -373,8 +373,8 @@ class Demo:
             errors = [row.error for row in own if row.estimated is not None]
             if errors:
                 before, after = own[0].injected, own[-1].injected
-                values = " to ".join(quantity_text(value, parameter.unit) for value in (before, after))
-                change = f"from {values} ({after / before - 1:+.1%})"
+                values = f"from {number_text(before)} to {number_text(after)} {unit_text(parameter.unit)}"
+                change = f"{values} ({after / before - 1:+.1%})"
                 error = f"largest error {max(errors):.3%} in {len(errors)} windows"
                 self._print(f"{parameter.name} went {change}; {error}")
 

@@ -34,6 +34,7 @@ from otolith.cli.common import (
 from otolith.cli.operation.history import history, report, reproduce
 from otolith.cli.operation.install import install, keys
 from otolith.cli.operation.view import view
+from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
     from otolith.publishing.zenoh_config import Credentials
@@ -158,10 +159,10 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
     from otolith.cli.commissioning.check import check_data, check_machine
 
     if data is not None:
-        return 0 if check_data(file, data, click.echo, as_json=as_json) else 1
+        return 0 if check_data(file, data, as_json=as_json) else 1
     if as_json:
         raise click.UsageError("--json needs DATA: it prints what recorded data offer")
-    return 0 if check_machine(file, click.echo, with_device=not no_device) else 1
+    return 0 if check_machine(file, echo, with_device=not no_device) else 1
 
 
 @cli.command()
@@ -274,9 +275,9 @@ def compile_command(file: Path) -> None:
     if failure:
         raise ServiceError(f"{file}: twin {machine.twin.name!r} cannot be compiled or run: {failure}")
     if count:
-        click.echo(f"compiled {counted(count, 'kernel')} in {time.monotonic() - begun:.0f} s: {folder}")
+        echo(f"compiled {counted(count, 'kernel')} in {time.monotonic() - begun:.0f} s: {folder}")
     else:
-        click.echo(f"all kernels are there: {folder}")
+        echo(f"all kernels are there: {folder}")
 
 
 @cli.command()
@@ -312,12 +313,12 @@ def plant(
         truth_file = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
         nodes = {name: stack.enter_context(closing(open_node(name, loaded))) for name in dict.fromkeys(transports)}
         for node in nodes.values():
-            click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
+            echo(f"{node.title()}; Ctrl-C ends it", err=True)
         counts = run_nodes(nodes, loaded, truth_file, stop.received, duration)
     if summary is not None:
         write_summary(summary, loaded, counts)
     for name, node in nodes.items():
-        click.echo(node.summary_line(counts[name]), err=True)
+        echo(node.summary_line(counts[name]), err=True)
     return stop.code(clean=signal.SIGTERM)
 
 

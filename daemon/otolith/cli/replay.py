@@ -8,7 +8,6 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
-import click
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +15,9 @@ from rich.text import Text
 from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, restore_components
 from otolith.cli.common import echo_warnings, progress_line
+from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
+from otolith.cli.terminal import echo
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
 from otolith.health.text import component_text, event_text, finding_text, headline, value_cells
@@ -129,7 +130,7 @@ def replay(
     summary = ReplaySummary()
     with open_recordings(machine, data) as recorded:
         if recorded.ignored:
-            click.echo(f"{recorded.path}: columns not used: {', '.join(recorded.ignored)}", err=True)
+            echo(f"{recorded.path}: columns not used: {', '.join(recorded.ignored)}", err=True)
         if not as_json:
             _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
@@ -146,14 +147,14 @@ def replay(
                 keep(report.document)
                 show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
                 if as_json:
-                    click.echo(report.document.to_json())
+                    echo(report.document.to_json())
     if as_json:
         echo_warnings(data[0], run.warnings())
         return
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
+    console = Terminal(width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 @contextmanager
@@ -196,4 +197,4 @@ def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool
     with suppress(OtolithError):  # the replay itself raises what is wrong with the file
         preview = preview_recording(machine, data, stopped, max_rows=PREVIEWED_ROWS)
         for line in short_lines(preview):
-            click.echo(line, err=True)
+            echo(line, err=True)

@@ -342,8 +342,8 @@ class ReportDocument(DocumentModel):
     notes: tuple[str, ...] = ()  # About the daemon since its start: which saved state it could not use, and why
 
     def to_json(self) -> str:
-        """Return the published JSON: ``schema`` first, absent keys where there is no content."""
-        return self.model_dump_json(exclude_none=True).replace('"schema_"', '"schema"', 1)
+        """Return the published JSON in one line: ``schema`` first, absent keys where there is no content."""
+        return self.json_line().replace('"schema_"', '"schema"', 1)
 
     @classmethod
     def from_json(cls, text: str) -> "ReportDocument":

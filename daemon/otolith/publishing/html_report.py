@@ -21,13 +21,13 @@ from markupsafe import Markup
 
 from otolith import __version__
 from otolith.acquisition.quality import is_of_calendar
-from otolith.estimation.information import QUANTILE
 from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import Texts, texts_in
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
-from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
+from otolith_drivers.outside_text import visible
+from otolith_drivers.units import equation_text, formula_text
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
 SILENT_WINDOWS = 3  # lengths of a window without a report until the state is NO DATA
@@ -44,8 +44,7 @@ STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 4
          604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
 WHOLE = re.compile(  # a date; a number with its interval and a short unit
     r"(\d{4}-\d\d-\d\d(?: [\d:.]+)?"
-    r"|\d[\d.]*(?:e-?\d+)? ± [\d.e-]+(?: [^\s\d.,;()±]{1,11})?"
-    r"|\d[\d.]*(?:e-?\d+)?(?: (?:%|°C|[pnµmkMG]?[ΩAVWN]\b|[nµm]?s\b))?)"
+    r"|\d[\d.]*(?:e-?\d+)?(?: [^\s\d.,;()±]{1,11}(?= ±))?(?: ± [\d.e-]+)?(?: (?:%|°C|[ΩAVWNs]\b))?)"
 )
 UNBROKEN = Markup('<span class="whole">{}</span>')
 MAX_WHOLE = 26  # characters: a line of a phone in the type of a value; engineering choice
@@ -107,7 +106,6 @@ class Curve:
     limits: tuple[tuple[Level, float, bool], ...]  # Level, value, and whether values below it are beyond it
     last: HistorySample | None
     away: Mapping[str, float]  # Percent of the windows with another status than estimated
-    scale: Scale  # In which its present value and all beside it are written
     plot: Mapping[str, Sequence[Any]] | None = None
     """``band``: polygons of the 95 % interval; ``lines``: whether the value was estimated then, and points; ``marks``;
     ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""
@@ -140,10 +138,12 @@ def html_report(
     curves = list(_curves(axis, gaps, rows, latest, description))
     curves.sort(key=lambda row: not urgent & {f"limit/{row.name}", f"component/{row.name.rpartition('/')[0]}"})
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+    )
     say = texts_in(latest.health.language if latest and latest.health else "en")
     own = {"when": _time_of_day if is_of_calendar(axis.begin) else text.moment_text, "words": say.translated}
-    environment.filters |= vars(text) | own | {"whole": whole, "quantity_text": quantity_text}
+    environment.filters |= vars(text) | own | {"whole": whole}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
     is_over = latest is not None and now <= latest.window.end
@@ -163,11 +163,16 @@ def _time_of_day(seconds: float) -> str:
 
 def whole(written: str) -> Markup:
     """Return a text in which no line ends within a date, or a number and its unit; a long interval has its own."""
-    texts = [Markup.escape(part) for part in WHOLE.split(written)]
+    texts = [Markup.escape(part) for part in WHOLE.split(visible(written))]
     for index in range(1, len(texts), 2):  # what matches
         parts = re.split(" (?=±)", texts[index]) if len(texts[index]) > MAX_WHOLE else [texts[index]]
         texts[index] = Markup(" ").join(UNBROKEN.format(part) if set("- ") & set(part) else part for part in parts)
     return Markup("").join(texts)
+
+
+def _shown(value: object) -> object:
+    """Return what the template inserts with its controls escaped; the engine escapes the signs of HTML."""
+    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
@@ -246,19 +251,9 @@ def _curves(
         for row in same:
             counts[row.status] += row.count
         away = {name: 100.0 * count / counts.total() for name, count in counts.items() if name not in TRUSTED}
-        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away, _scale(parameter, same))
+        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away)
         points = list(_thinned(axis, same))
         yield replace(curve, plot=_plot(axis, gaps, points, curve)) if points else curve
-
-
-def _scale(parameter: ParameterDocument | None, samples: Sequence[HistorySample]) -> Scale:
-    """Return how the numbers of a curve are written, by its present value; by its nominal value if it has none."""
-    if parameter is not None:
-        half = QUANTILE * (parameter.sd or 0.0)
-        return scale_of(
-            parameter.nominal if parameter.value is None else max(abs(parameter.value), half), parameter.unit
-        )
-    return scale_of(samples[-1].last, samples[-1].unit) if samples else Scale(0, "")
 
 
 def _thinned(axis: Axis, samples: Iterable[HistorySample]) -> Iterator[HistorySample]:

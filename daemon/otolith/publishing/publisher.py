@@ -105,7 +105,7 @@ class Publisher:
             (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
         ]
         others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
-        texts = [(key, item.model_dump_json(exclude_none=True)) for key, item in others]
+        texts = [(key, item.json_line()) for key, item in others]
         for each in sessions:
             each.reports.put(text)
             for key, own in texts:

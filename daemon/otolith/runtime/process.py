@@ -6,7 +6,6 @@ itself when the daemon has died.
 """
 
 import contextlib
-import json
 import logging
 import multiprocessing
 import multiprocessing.connection
@@ -24,6 +23,7 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 from otolith.health.schema import EventDocument
+from otolith_drivers.grammars.json_lines import json_text
 
 log = logging.getLogger(__name__)
 
@@ -251,9 +251,9 @@ class EventCommand:
         if len(self._threads) < MAX_RUNNING:
             self._threads.append(threading.Thread(target=self._work, name="event-command", daemon=True))
             self._threads[-1].start()
-        document = {**self._identity, "event": event.model_dump(mode="json", exclude_none=True)}
+        document = {**self._identity, "event": event.model_dump(exclude_none=True)}
         try:
-            self._texts.put_nowait(json.dumps(document))
+            self._texts.put_nowait(json_text(document))
         except queue.Full:
             self._fail(f"{MAX_WAITING_EVENTS} events wait for it: an event is dropped")
 

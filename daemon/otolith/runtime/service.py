@@ -46,6 +46,7 @@ from otolith.storage.history_writer import Numbers, history_of
 from otolith.storage.state_store import LockedError, StateWriter, store_of
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import OtolithError, ServiceError
+from otolith_drivers.outside_text import visible
 
 log = logging.getLogger(__name__)
 
@@ -130,10 +131,10 @@ class Notifier:
         """Timeout of systemd's watchdog in s, or None if there is no watchdog."""
 
     def send(self, *assignments: str) -> None:
-        """Send assignments such as ``READY=1``; line breaks in them become spaces."""
+        """Send assignments such as ``READY=1``; line breaks in them are escaped, as each line is an assignment."""
         if self._socket is None:
             return
-        text = "\n".join(" ".join(assignment.split()) for assignment in assignments)
+        text = "\n".join(map(visible, assignments))
         try:  # MSG_DONTWAIT: a full queue must not block; a dropped message is repeated by the next one
             self._socket.sendmsg([text.encode()], [], socket.MSG_DONTWAIT, self._address)
         except OSError:
@@ -311,7 +312,7 @@ class Service:
             files = self._evidence.files if change.needs_restart else files_of(change.machine)
             decisions = self._store.decisions()
         except (OtolithError, OSError) as error:
-            log.warning("not reloaded, the daemon goes on as before: %s", error)
+            log.warning("not reloaded, the daemon goes on as before: %s", "; ".join(str(error).split("\n")))
             return
         self._machine, self._evidence.files = change.machine, files
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)

@@ -46,7 +46,8 @@ from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.toml_lines import toml_key, toml_value
+from otolith_drivers.grammars.toml_lines import toml_key, toml_value
+from otolith_drivers.outside_text import visible
 from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ MAX_EVIDENCE_BYTES = 64 << 20  # of a bundle, packed and unpacked
 MAX_BUNDLES = 1000  # of a machine
 MIN_WINDOWS = 16  # before a change of an event that its bundle has, and at most twice as many
 MAX_WINDOW_BYTES = 8 << 20  # of windows after which fewer are enough
+MAX_REASON = 300  # characters of the error of a library
 MAX_WAITING_BUNDLES = 4  # for the disk; more are dropped
 REFERENCE, AUGMENTED, BITS = "=", "augmented", "bits"  # keys of an object that occurred before, a twin, and an array
 
@@ -224,7 +226,7 @@ def read_bundle(path: Path) -> Bundle:
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # of any type, from archives and values that are damaged or forged
-        text = printable((reason_of(error) or type(error).__name__).splitlines()[0])
+        text = visible((reason_of(error) or type(error).__name__).splitlines()[0], MAX_REASON)
         raise ConfigurationError(f"{path}: no evidence that this Otolith can use, or damaged: {text}") from error
 
 
@@ -246,11 +248,6 @@ def _limited(stream: Any, limit: int) -> bytes:
     if len(content := stream.read(limit + 1)) > limit:
         raise ValueError(f"larger than {limit} bytes")
     return bytes(content)
-
-
-def printable(text: str) -> str:
-    """Return ``text`` without what would control a terminal: a bundle may come from anywhere."""
-    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def files_of(machine: LoadedMachine) -> dict[str, str]:

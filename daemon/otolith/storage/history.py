@@ -147,10 +147,10 @@ class Tables:
             self._add_states({"": health, **health.parts}, document.sequence or 0, end)
         for event in document.events:
             if event.change is not None:
-                row = (event.sequence, end, event.model_dump_json(exclude_none=True))
+                row = (event.sequence, end, event.json_line())
                 execute("INSERT OR REPLACE INTO event VALUES (?, ?, ?)", row)
         for finding in document.findings:
-            text_of = finding.model_dump_json(exclude_none=True)
+            text_of = finding.json_line()
             known = execute(
                 "UPDATE finding SET last = ?, count = count + 1, text = ? WHERE id = ? AND last BETWEEN ? AND ?",
                 (end, text_of, finding.id, end - FINDING_PAUSE, end + FINDING_PAUSE),

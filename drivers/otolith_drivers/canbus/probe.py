@@ -23,8 +23,8 @@ from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.options import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
+from otolith_drivers.grammars.toml_lines import toml_comment, toml_value
 from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, spread
-from otolith_drivers.toml_lines import toml_comment, toml_value
 
 MAX_IDENTIFIERS = 2048  # that are kept apart; a bus with standard identifiers has no more
 MAX_FRAMES = 500  # of each identifier that are kept

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith_drivers.errors import DeviceError
+from otolith_drivers.grammars.toml_lines import toml_comment, toml_value
 from otolith_drivers.modbus.client import (
     BUSY_CODES,
     GATEWAY_CODES,
@@ -38,7 +39,6 @@ from otolith_drivers.number_inference import (
     register_layouts,
     spread,
 )
-from otolith_drivers.toml_lines import toml_comment, toml_value
 
 # Engineering choices, guarded by tests/drivers/modbus/test_probe.py.
 MAX_TIMES = 1000  # round trips kept of each length of request

@@ -1,6 +1,5 @@
 """``otolith check``: what the daemon would do with a machine file, and whether its signals come."""
 
-import json
 import math
 import time
 from collections import Counter
@@ -10,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.cli.common import progress_line
+from otolith.cli.terminal import echo, echo_json
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
@@ -52,7 +52,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     return set(machine.twin.signals) <= set(counts)
 
 
-def check_data(path: Path, data: Path, echo: Callable[[str], None], *, as_json: bool) -> bool:
+def check_data(path: Path, data: Path, *, as_json: bool) -> bool:
     """Print what the daemon would do with ``data``, and what the data offer: line by line, or the latter as JSON.
 
     Returns:
@@ -65,10 +65,9 @@ def check_data(path: Path, data: Path, echo: Callable[[str], None], *, as_json: 
     with progress_line("reading", enabled=not as_json) as show:
         preview = preview_recording(machine, data, progress=show)
     if as_json:
-        echo(json.dumps(preview.document(), indent=2, ensure_ascii=False))
+        echo_json(preview.document(), indent=2)
         return preview.is_usable
-    for line in (*describe(machine, preview.sources), *preview_lines(preview)):
-        echo(line)
+    echo(*describe(machine, preview.sources), *preview_lines(preview))
     if not preview.is_usable:
         windows = "no window can be used" if preview.windows.count else "the data are too short for a window"
         echo(f"{windows} as {path.name} configures them")

@@ -1,6 +1,5 @@
 """``otolith components``, ``reset``, ``baseline``, ``commission``: what a twin lacks, and what the machine is like."""
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from otolith.cli.common import (
     progress_line,
     use_state_of_service,
 )
+from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
@@ -61,17 +61,17 @@ def list_(file: Path, as_json: bool) -> None:
     if as_json:
         rows = [TypeAdapter(ComponentRecord).dump_python(record, mode="json") for record in records]
         keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
-        click.echo(json.dumps({"components": rows, **keys}, ensure_ascii=False))
+        echo_json({"components": rows, **keys})
         return
     labels = store.labels()
     for record in records:
         onset = labels.unix(record.adopted.onset)
         decision = _decision(record, decisions)
-        click.echo(f"{_key(record)}  {_equation(machine, record)}  since {local_time(onset)}  {decision}")
+        echo(f"{_key(record)}  {_equation(machine, record)}  since {local_time(onset)}  {decision}")
     for key in sorted(decisions.rejected - {_key(record) for record in records}):
-        click.echo(f"{key}  rejected: not searched for")
+        echo(f"{key}  rejected: not searched for")
     if not records and not decisions.rejected:
-        click.echo(f"{machine.file.machine.name}: no component has been found", err=True)
+        echo(f"{machine.file.machine.name}: no component has been found", err=True)
 
 
 def _key(record: "ComponentRecord") -> str:
@@ -86,14 +86,12 @@ def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
 
 
 def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
-    from otolith.estimation.problem import equation, site_of
-    from otolith.health.text import interval_text
+    from otolith.estimation.problem import equation
+    from otolith.health.text import half_width_text
     from otolith_drivers.units import equation_text
 
-    component = record.adopted.component
-    text = equation_text(equation(machine.twin, component, record.values))
-    unit = site_of(machine.twin, component.site).unit
-    return f"{text} (amplitude {interval_text(record.values[0], record.deviations[0], unit)})"
+    text = equation_text(equation(machine.twin, record.adopted.component, record.values))
+    return f"{text} (amplitude ± {half_width_text(record.deviations[0])})"
 
 
 @components.command()
@@ -153,7 +151,7 @@ def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorD
         raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
     rest = replace(decisions, approved=decisions.approved - {component}, rejected=decisions.rejected - {component})
     store.save_decisions(add(rest))
-    click.echo(f"{component} is {decision}")
+    echo(f"{component} is {decision}")
 
 
 @click.command()
@@ -182,14 +180,14 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
     try:
         known += map(_key, store.components())
     except OtolithError as error:
-        click.echo(f"components cannot be named: {error}", err=True)
+        echo(f"components cannot be named: {error}", err=True)
     for name in names:
         if name not in known:
             raise ConfigurationError(f"no parameter or component {name!r}: {nearest(name, known)}")
     if not dry_run:
         times = dict.fromkeys(names or (EVERYTHING,), time.time())
         store.save_decisions(replace(decisions, resets={**decisions.resets, **times}))
-    click.echo("\n".join(f"{name} {'would be' if dry_run else 'is'} forgotten" for name in names or known))
+    echo(*(f"{name} {'would be' if dry_run else 'is'} forgotten" for name in names or known))
 
 
 def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
@@ -236,18 +234,18 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
     state = None if is_useless else _replayed(machine, data)
     if state is None or not state.adopted:  # the file's noise levels may have hidden a component
         state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
-    click.echo("\n".join(noise_lines(machine, identified)))
+    echo(*noise_lines(machine, identified))
     if record.offered:
-        click.echo("# this process noise is right with the components below: if you approve them, put it into the file")
+        echo("# this process noise is right with the components below: if you approve them, put it into the file")
     elif state.adopted:
-        click.echo("# this process noise contains the components below: keep that of the file if you approve them")
+        echo("# this process noise contains the components below: keep that of the file if you approve them")
     else:
-        click.echo("# put these tables into the machine file in place of its own", err=True)
+        echo("# put these tables into the machine file in place of its own", err=True)
     _review(machine, store, state, components, approve_all=approve_all)
     try:
         keep_baseline(machine, store, state.health.histories)
     except OtolithError as error:  # nothing that has limits, or a record that is too short
-        click.echo(str(error), err=True)
+        echo(*str(error).split("\n"), err=True)
 
 
 def _replayed(
@@ -266,7 +264,7 @@ def _replayed(
         for report in run.reports():
             show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
             for finding in report.document.findings:
-                click.echo(f"window {report.document.window.index}: {finding.text}", err=True)
+                echo(f"window {report.document.window.index}: {finding.text}", err=True)
         echo_warnings(data, run.warnings())
         return run.state
 
@@ -290,21 +288,21 @@ def _review(
     records = tuple(precise.get(_key(record), record) for record in component_records(state))
     approved, rejected = set[str](), set[str]()
     for record in records:
-        click.echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
+        echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
         (approved if approve_all or _is_healthy() else rejected).add(_key(record))
     decisions = store.decisions()
     if store.components_path.exists():
-        click.echo(f"what was learned before is kept as {store.set_aside()}", err=True)
+        echo(f"what was learned before is kept as {store.set_aside()}", err=True)
     store.save_components(tuple(record for record in records if _key(record) in approved))
     rejected = {*decisions.rejected, *rejected} - approved
     store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
     if not records:
-        click.echo("no component was found: the twin explains the machine up to the noise", err=True)
+        echo("no component was found: the twin explains the machine up to the noise", err=True)
     posterior = state.posterior.prior()
     for index, parameter in enumerate(state.problem.free):
         if not parameter.name.startswith("_"):
             mean, variance = float(posterior.mean[index]), float(posterior.covariance[index, index])
-            click.echo(f"{parameter.name} = {interval_text(mean, variance**0.5, parameter.unit)}", err=True)
+            echo(f"{parameter.name} = {interval_text(mean, variance**0.5, parameter.unit)}", err=True)
 
 
 def _is_healthy() -> bool:
@@ -313,7 +311,7 @@ def _is_healthy() -> bool:
             "does it belong to the healthy machine? (n rejects it: it is not searched for again)", err=True
         )
     except click.Abort:
-        click.echo("\nno answer: nothing is kept; answer y or n, or give --yes", err=True)
+        echo("", "no answer: nothing is kept; answer y or n, or give --yes", err=True)
         raise
 
 
@@ -334,7 +332,7 @@ def baseline(file: Path, clear: bool) -> None:
     machine, store = _store(file)
     if clear:
         store.save_decisions(replace(store.decisions(), baselines={}))
-        click.echo("limits in percent refer to the nominal values of the machine file")
+        echo("limits in percent refer to the nominal values of the machine file")
     else:
         keep_baseline(machine, store, store.histories())
 
@@ -343,9 +341,9 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     """Store and print the baselines of ``histories``; raise ConfigurationError if there are too few estimates."""
     from otolith.health.limits import Level
     from otolith.health.prognosis import MIN_POINTS, baselines
-    from otolith.health.text import interval_text
+    from otolith.health.text import interval_text, number_text
     from otolith_drivers.errors import ConfigurationError
-    from otolith_drivers.units import quantity_text
+    from otolith_drivers.units import unit_text
 
     limited = {name: row for name, row in machine.plan.parameters.items() if row.limits}
     kept = {name: item for name, item in baselines(histories).items() if name in limited}
@@ -356,10 +354,10 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     store.save_decisions(replace(store.decisions(), baselines={**store.decisions().baselines, **kept}))
     for name, item in kept.items():
         text, end = interval_text(item.value, item.sd, limited[name].unit), store.labels().unix(item.end)
-        click.echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}", err=True)
+        echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}", err=True)
         level, limit = limited[name].level(item.value, item.sd, Level.OK)
         if limit is not None:
-            beyond = f"{level} {limit.side} {quantity_text(limit.value, limited[name].unit)}"
-            click.echo(f"{name}: beyond its limit {beyond}; if the machine is not healthy, undo it: --clear", err=True)
+            beyond = f"{level} {limit.side} {number_text(limit.value)} {unit_text(limited[name].unit)}"
+            echo(f"{name}: beyond its limit {beyond}; if the machine is not healthy, undo it: --clear", err=True)
     for name in limited.keys() - kept.keys():
-        click.echo(f"{name} has fewer than {MIN_POINTS} estimates: its limits stay as they were", err=True)
+        echo(f"{name} has fewer than {MIN_POINTS} estimates: its limits stay as they were", err=True)

@@ -1,6 +1,5 @@
 """``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
+from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
@@ -40,10 +40,10 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     machine = load_machine(file, with_driver=False)
     record = identified_record(machine, data, windows)
     if as_json:
-        click.echo(json.dumps(_document(machine, record), indent=2, ensure_ascii=False))
+        echo_json(_document(machine, record), indent=2)
     else:
         lines = [*noise_lines(machine, record.noise), *structure_lines(machine, record.structure), ""]
-        click.echo("\n".join([*lines, *delay_lines(machine, record.delays)]))
+        echo(*lines, *delay_lines(machine, record.delays))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ def identified_record(machine: "LoadedMachine", data: Path, count: int) -> Healt
             if {item.component.key for item in beside} & {item.component.key for item in structure}:
                 record = HealthyRecord(without_delays(delays, declared), without, beside, chosen)
     if machine.problem.open_loop:
-        click.echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
+        echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:
         raise ConfigurationError(f"{data}: {'; '.join(identified.remarks)}")
     return record
@@ -181,16 +181,15 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
     """What all windows show and the twin lacks, as comments."""
-    from otolith.estimation.problem import equation, site_of
-    from otolith.health.text import interval_text
+    from otolith.estimation.problem import equation
+    from otolith.health.text import half_width_text
 
     for item in structure:
         component = item.component
         values = (component.amplitude, component.inner, component.phase)
         text = equation(machine.twin, component, values[: 2 if item.is_restarted else 3])
         again = f", again every {_repeat(machine, item)}" if component.periodic else ""
-        amplitude = interval_text(component.amplitude, item.sd, site_of(machine.twin, component.site).unit)
-        yield f"# structure: {component.key}: {text} (amplitude {amplitude}){again}"
+        yield f"# structure: {component.key}: {text} (amplitude ± {half_width_text(item.sd)}){again}"
         if item.is_at_bound:
             yield f"# its {_inner_meaning(item)} lies at a bound of the search, so its shape is not known: not offered"
     if structure:

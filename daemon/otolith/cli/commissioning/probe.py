@@ -1,7 +1,6 @@
 """``otolith probe``: what is on a bus, and lines for the machine file."""
 
 import contextlib
-import json
 import re
 import time
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
+from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
     from otolith.cli.commissioning.probe_view import DeviceProbe
@@ -136,13 +136,13 @@ def modbus(
         answers = _scan(place, devices, first - first_address, stop)
         if as_json:
             rows = [{"device": answer.device, "refused": answer.reply} for answer in answers]
-            click.echo(json.dumps({"devices": rows}))
+            echo_json({"devices": rows})
         else:
-            click.echo("\n".join(_scan_lines(place, devices, answers)))
+            echo(*_scan_lines(place, devices, answers))
         return stop.code() or (0 if answers else NOTHING_THERE)
     probed = _read(place, (first - first_address, last - first_address), seconds, stop)
     if as_json:
-        click.echo(json.dumps(modbus_document(probed), ensure_ascii=False))
+        echo_json(modbus_document(probed))
     else:
         show_device(probed, stdout_console(), wide=wide)
     return stop.code() or (0 if probed.survey.blocks else NOTHING_THERE)
@@ -247,11 +247,11 @@ def can_(
     picture = _listen(options, database, seconds, stop, live=not as_json)
     elapsed = time.monotonic() - begun
     if as_json:
-        click.echo(json.dumps(can_document(picture, options, database, elapsed), ensure_ascii=False))
+        echo_json(can_document(picture, options, database, elapsed))
     else:
         show_bus(picture, options, database, elapsed, stdout_console())
         if not picture.frames:
-            click.echo("\n".join((*remarks(picture), *_hints(options, picture))))
+            echo(*remarks(picture), *_hints(options, picture))
     return stop.code() or (0 if picture.frames else NOTHING_THERE)
 
 
@@ -363,11 +363,11 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     with progress_line(f"reading {endpoint}"):
         variables = asyncio.run(_browse(options, most))
     if as_json:
-        click.echo(json.dumps({"variables": [_opcua_document(one) for one in variables]}, ensure_ascii=False))
+        echo_json({"variables": [_opcua_document(one) for one in variables]})
     else:
         console = stdout_console()
         for variable in variables:
-            console.print(_opcua_line(variable), markup=False, soft_wrap=True)
+            console.print(_opcua_line(variable), soft_wrap=True)
         count = f"{len(variables)} variables" + (", as many as --most allows" if len(variables) == most else "")
         console.print(count if variables else "no variables beside those of OPC UA itself")
     return 0 if variables else NOTHING_THERE
@@ -396,7 +396,7 @@ def _opcua_document(variable: "Variable") -> dict[str, Any]:
 
 def _opcua_line(variable: "Variable") -> str:
     """Return a line for [signals], with the rest as a comment."""
-    from otolith_drivers.toml_lines import toml_comment, toml_key, toml_value
+    from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 
     name = "".join(sign if sign.isalnum() else "_" for sign in variable.path.rpartition("/")[2]) or "signal"
     value = str(variable.value)

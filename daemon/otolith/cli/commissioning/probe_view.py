@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from cantools.database import Signal
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from otolith.cli.console import Terminal
 from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.errors import counted, some_names
@@ -37,8 +38,8 @@ Row = dict[str, str]  # Cells by the name of their column; a header has one line
 
 def stdout_console() -> Console:
     """Standard output, as wide as the terminal or ``PLAIN_WIDTH``."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
+    console = Terminal()
+    return console if console.is_terminal else Terminal(width=PLAIN_WIDTH)
 
 
 def fitted_tables(fixed: tuple[str, ...], rows: Sequence[Row], width: int) -> Iterator[Table]:
@@ -72,7 +73,7 @@ def _table(fixed: tuple[str, ...], names: Sequence[str], rows: Sequence[Row]) ->
     table = Table(box=None, padding=(0, GAP, 0, 0), header_style="bold")
     for name in (*fixed, *names):
         left = name in fixed or name in TEXT_COLUMNS
-        table.add_column(name.replace(" ", "\n"), justify="left" if left else "right", vertical="bottom",
+        table.add_column(Group(*name.split()), justify="left" if left else "right", vertical="bottom",
                          no_wrap=name not in TEXT_COLUMNS)  # fmt: skip
     for row in rows:
         cells = [row.get(name, "") for name in names]
@@ -131,7 +132,7 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
     if probe.single:
         console.print(SINGLE_LEGEND, style="dim", soft_wrap=True)
     for line in ("", *_modbus_lines(probe)):
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 def _modbus_lines(probe: DeviceProbe) -> list[str]:
@@ -335,13 +336,14 @@ def show_bus(
     picture: canbus.Picture, options: BusOptions, database: Path | None, seconds: float, console: Console
 ) -> None:
     """Print the frames that came, the signals in them, and lines for the machine file."""
-    console.print(f"{bus_title(options, picture)} in {seconds:.1f} s\n")
+    console.print(f"{bus_title(options, picture)} in {seconds:.1f} s")
+    console.print()
     if not picture.frames:
         return
-    console.print(*tables(picture, console.width), sep="\n")
-    console.print(CAN_LEGEND, style="dim", markup=False, soft_wrap=True)
+    console.print(Group(*tables(picture, console.width)))
+    console.print(CAN_LEGEND, style="dim", soft_wrap=True)
     for line in ("", *_can_lines(picture, options, database)):
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 def _can_lines(picture: canbus.Picture, options: BusOptions, database: Path | None) -> list[str]:

@@ -1,12 +1,12 @@
 """``otolith twin``: the library of twins, one twin as a page of equations, and the check of a user's own twin."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from otolith.cli.common import AS_JSON, FILE
+from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
     from otolith.twin.definition import Definition
@@ -39,11 +39,11 @@ def list_(as_json: bool) -> None:
 
     twins = [find_twin(name) for name in library_twins()]
     if as_json:
-        click.echo(json.dumps([{"name": twin.name, "title": twin.title} for twin in twins]))
+        echo_json([{"name": twin.name, "title": twin.title} for twin in twins])
         return
     width = max(len(twin.name) for twin in twins)
     for twin in twins:
-        click.echo(f"{twin.name:{width}}  {twin.title}")
+        echo(f"{twin.name:{width}}  {twin.title}")
 
 
 @twin.command()
@@ -69,10 +69,10 @@ def show(name: str, latex: bool, as_json: bool) -> None:
 
     definition = load_twin(Path(name)) if name.endswith(".toml") else find_twin(name)
     if latex:
-        click.echo(latex_page(definition))
+        echo(*latex_page(definition).split("\n"))
     elif as_json:
         document = asdict(definition) | {"structure": [asdict(row) for row in structural_identifiability(definition)]}
-        click.echo(json.dumps(document, indent=2, ensure_ascii=False))
+        echo_json(document, indent=2)
     else:
         _print(definition)
 
@@ -92,19 +92,21 @@ def check(file: Path) -> None:
 
 
 def _print(definition: "Definition") -> None:
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
+    from otolith.cli.console import Terminal
     from otolith.twin.definition import Role
     from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import unicode_page
 
-    console = Console(width=max(Console().width, MIN_WIDTH), highlight=False)
-    console.print(f"[bold]{definition.title}[/bold] ({definition.name})")
-    console.print(f"source: {definition.source}", markup=False)
+    console = Terminal(width=max(Terminal().width, MIN_WIDTH))
+    console.print(Text.assemble((definition.title, "bold"), f" ({definition.name})"))
+    console.print(f"source: {definition.source}")
     if definition.validity:
-        console.print(f"valid: {definition.validity}", markup=False)
-    console.print(f"\n{unicode_page(definition)}\n", markup=False, soft_wrap=True)
+        console.print(f"valid: {definition.validity}")
+    for line in ("", *unicode_page(definition).split("\n"), ""):
+        console.print(line, soft_wrap=True)
     structure = {row.name: row for row in structural_identifiability(definition)}
     table = Table("parameter", "nominal", "bounds", "unit", "role", "could be estimated", "meaning")
     for parameter in definition.parameters:

@@ -1,6 +1,5 @@
 """``otolith history``, ``report`` and ``reproduce``: what was estimated and announced, and its computation again."""
 
-import csv
 import json
 import os
 import re
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith.cli.common import AS_JSON, DEMOS, FILE, local_time, new_file, progress_line, use_state_of_service
+from otolith.cli.terminal import echo, echo_csv, echo_json
 
 if TYPE_CHECKING:
     from otolith.health.schema import EventDocument
@@ -144,9 +144,7 @@ def reader_of(machine: str) -> "HistoryReader":
     if not chosen:
         demos = {reader.machine: reader for reader in _demos()}  # the last one of each name
         if machine in demos:
-            click.echo(
-                f"no machine is named {machine!r}: this is the demo in {demos[machine].path.parents[1]}", err=True
-            )
+            echo(f"no machine is named {machine!r}: this is the demo in {demos[machine].path.parents[1]}", err=True)
             return demos[machine]
         hint = nearest(machine, [*(reader.machine for reader in known), *demos])
         raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")
@@ -206,18 +204,14 @@ def _utc(seconds: float) -> str:
 def _print_samples(samples: "Iterable[HistorySample]") -> None:
     from otolith.storage.history import HistorySample
 
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(("parameter", *(column.name for column in fields(HistorySample)[1:])))
-    for sample in samples:
-        writer.writerow((asdict(sample) | {"time": _utc(sample.time)}).values())
+    echo_csv([("parameter", *(column.name for column in fields(HistorySample)[1:]))])
+    echo_csv((asdict(sample) | {"time": _utc(sample.time)}).values() for sample in samples)
 
 
 def _print_events(events: "Iterable[EventDocument]") -> None:
     columns = ("change", "part", "state", "condition", "cause", "text", "advice", "id", "reason")
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(("time", *columns))
-    for event in events:
-        writer.writerow([_utc(event.end or event.since), *(getattr(event, name) for name in columns)])
+    echo_csv([("time", *columns)])
+    echo_csv([_utc(event.end or event.since), *(getattr(event, name) for name in columns)] for event in events)
 
 
 def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
@@ -257,7 +251,7 @@ def _print_json(
         "findings": reader.findings(since),
         "counters": reader.counters(since),
     }
-    click.echo(json.dumps(content, ensure_ascii=False))
+    echo_json(content)
 
 
 def _print_table(
@@ -270,12 +264,11 @@ def _print_table(
     *,
     with_findings: bool,
 ) -> None:
-    from rich.console import Console
-
+    from otolith.cli.console import Terminal
     from otolith.cli.operation.live_table import event_style
     from otolith.health.text import event_text
 
-    console = Console()
+    console = Terminal(highlight=True)
     first = min((sample.time for sample in samples), default=since)
     values = f", values per {interval}" if samples else ""
     console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}{values}")
@@ -283,16 +276,16 @@ def _print_table(
         console.print(_table(samples, console.width))
     for event in events[-MAX_EVENTS:]:
         change = "" if event.end is not None else f"{event.change}: "  # the text of a cleared event begins with it
-        console.print(f"{change}{event_text(event, local_time)}", style=event_style(event), markup=False)
+        console.print(f"{change}{event_text(event, local_time)}", style=event_style(event))
         if (bundle := bundles.get(event.sequence)) is not None:
-            click.echo(f"  otolith reproduce {shlex.quote(str(bundle))}")
+            echo(f"  otolith reproduce {shlex.quote(str(bundle))}")
     if len(events) > MAX_EVENTS:
         console.print(f"and {len(events) - MAX_EVENTS} earlier changes of events: --events --csv has them")
     for finding in reader.findings(since) if with_findings else ():
         span = f"{local_time(finding['first'])} to {local_time(finding['last'])}"
-        console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows", markup=False)
+        console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows")
     if not samples and not events:
-        click.echo("no values or events since then", err=True)
+        echo("no values or events since then", err=True)
 
 
 def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
@@ -307,7 +300,8 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
 def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
-    from otolith_drivers.units import scale_of
+    from otolith.health.text import number_text, number_texts
+    from otolith_drivers.units import unit_text
 
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
@@ -326,9 +320,8 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
         reach = None if end.low is None or end.high is None else 0.5 * (end.high - end.low)
         change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
-        scale = scale_of(max(abs(end.last), reach or 0.0), unit)
-        limits = (scale.number(low), scale.number(high)) if has_range else ()
-        table.add_row(name, *scale.numbers(end.last, reach), scale.unit, change, *limits, curve)
+        limits = (number_text(low), number_text(high)) if has_range else ()
+        table.add_row(name, *number_texts(end.last, reach), unit_text(unit), change, *limits, curve)
     return table
 
 
@@ -361,7 +354,7 @@ def report(machine: str, since: Since, output: Path | None) -> None:
         return
     path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
     write_page(path, content)
-    click.echo(path)
+    echo(path)
 
 
 def page_of(reader: "HistoryReader", since: float, end: float) -> bytes:
@@ -378,7 +371,7 @@ def page_of(reader: "HistoryReader", since: float, end: float) -> bytes:
         page = html_report(reader, samples_since(reader, interval, since, ()), interval, since, end)
     except ValueError as error:
         raise ConfigurationError(f"{reader.path}: cannot be read: {error}") from error
-    return page.encode(errors="backslashreplace")  # a text of a machine may have half a character
+    return page.encode()
 
 
 def write_page(path: Path, content: bytes) -> None:
@@ -410,11 +403,11 @@ def reproduce(bundle: Path, as_json: bool) -> int:
       otolith reproduce hall.press-3-000007-20260131T101112.zip --json
     """
     from otolith.health.text import event_text
-    from otolith.storage.evidence import printable, read_bundle, versions
+    from otolith.storage.evidence import read_bundle, versions
     from otolith_drivers.errors import counted
 
-    def echo(line: str) -> None:
-        click.echo(printable(line), err=as_json)
+    def tell(line: str) -> None:
+        echo(line, err=as_json)
 
     read = read_bundle(bundle)
     state, count, last = read.state, len(read.windows), read.windows[-1].window
@@ -423,16 +416,16 @@ def reproduce(bundle: Path, as_json: bool) -> int:
         return local_time(time + last.ahead)
 
     span = read.windows[0].window.start, last.end
-    echo(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(when, span))}")
+    tell(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(when, span))}")
     for event in read.events:
-        echo(f"{'' if event.end else f'{event.change}: '}{event_text(event, when)}")
-    echo(f"seed {state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
+        tell(f"{'' if event.end else f'{event.change}: '}{event_text(event, when)}")
+    tell(f"seed {state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
     with progress_line("reproducing") as show:
-        difference = _first_difference(read, show, click.echo if as_json else lambda _: None)
+        difference = _first_difference(read, show, echo if as_json else lambda _: None)
     others = [f"{name} {here}" for name, here in versions().items() if read.versions.get(name) != here]
     if others:
-        echo(f"other versions here, on which the last bits may depend: {', '.join(others)}")
-    echo(f"not the same: {difference}" if difference else f"the same to the last bit: {counted(count, 'report')}")
+        tell(f"other versions here, on which the last bits may depend: {', '.join(others)}")
+    tell(f"not the same: {difference}" if difference else f"the same to the last bit: {counted(count, 'report')}")
     return 1 if difference else 0
 
 

@@ -22,6 +22,7 @@ import click
 
 from otolith.cli.common import MACHINE_FILE, shipped_directory
 from otolith.cli.operation.unit_file import addresses, comment, directive
+from otolith.cli.terminal import echo
 from otolith_drivers.errors import ConfigurationError, ServiceError, shown, some_names
 
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
@@ -71,15 +72,15 @@ def install(file: Path, dry_run: bool, root: Path) -> None:
         others = [other.name for other in _machines_with(root / item.path, root / ETC) if other.name != file.name]
         if _put(item, root, dry_run=dry_run) and others:
             remedy = "if they need another one, give this file another name"
-            click.echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
+            echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
     for command, user in _commands(file.stem, private, closed):
-        click.echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
+        echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
         if is_here and not dry_run:
             _run(command, user, file.stem)
     if not PROGRAM.exists():
-        click.echo(f"missing: {PROGRAM}, which the unit starts: make the environment /opt/otolith first", err=True)
-    click.echo(f"start it: systemctl enable --now otolith@{file.stem}")
+        echo(f"missing: {PROGRAM}, which the unit starts: make the environment /opt/otolith first", err=True)
+    echo(f"start it: systemctl enable --now otolith@{file.stem}")
 
 
 def _files(file: Path) -> Iterator[InstalledFile]:
@@ -205,11 +206,11 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     before = path.read_bytes() if path.is_file() else None
     if before == item.content:
         is_open = item.is_private and bool(path.stat().st_mode & 0o007)
-        click.echo(f"{('to ' if dry_run else '') + 'restrict' if is_open else 'unchanged'}: {path}")
+        echo(f"{('to ' if dry_run else '') + 'restrict' if is_open else 'unchanged'}: {path}")
         if is_open and not dry_run:
             path.chmod(0o640)
         return False
-    click.echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
+    echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
     if dry_run:
         return before is not None
     umask = os.umask(0o022)  # that of root may close the folders to the service
@@ -319,8 +320,8 @@ def init(folder: Path) -> int:
     from otolith.publishing.certificates import make_authority, utc_now
 
     expiry = make_authority(folder, utc_now())
-    click.echo(f"{folder / 'ca.crt'}: certificate of the authority, for every daemon and reader; expires {expiry:%F}")
-    click.echo(f"{folder / 'ca.key'}: its private key; keep it where no daemon runs")
+    echo(f"{folder / 'ca.crt'}: certificate of the authority, for every daemon and reader; expires {expiry:%F}")
+    echo(f"{folder / 'ca.key'}: its private key; keep it where no daemon runs")
     return 0
 
 
@@ -343,6 +344,6 @@ def add(folder: Path, name: str, hosts: tuple[str, ...]) -> int:
 
     expiry = make_certificate(folder, name, hosts, utc_now())
     purpose = f"a daemon at {', '.join(hosts)}" if hosts else "a reader"
-    click.echo(f"{folder / name}.crt: certificate of {purpose}; expires {expiry:%F}")
-    click.echo(f"{folder / name}.key: its private key, for {name} alone")
+    echo(f"{folder / name}.crt: certificate of {purpose}; expires {expiry:%F}")
+    echo(f"{folder / name}.key: its private key, for {name} alone")
     return 0

@@ -1,11 +1,10 @@
 """``otolith watch``: reports of daemons in other processes, as a stream or as a live table in a terminal."""
 
 import queue
-import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,8 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import drain, local_time
+from otolith.cli.console import Terminal
+from otolith.cli.terminal import echo
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
 from otolith.health.text import (
@@ -33,6 +34,7 @@ from otolith.health.text import (
     value_cells,
     value_text,
 )
+from otolith_drivers.grammars.json_lines import checked_line
 from otolith_drivers.units import equation_text
 
 if TYPE_CHECKING:
@@ -113,7 +115,7 @@ class LiveTable:
         """Take a published report; None, and counted, if this version cannot read it."""
         try:
             document = ReportDocument.from_json(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             with self._lock:
                 self._unreadable += 1
             return None
@@ -336,7 +338,7 @@ def watch_reports(
                 _stream(texts, subscriber, stopped)
                 return
             table = LiveTable(subscriber.state)
-            with Live(table, console=Console(), refresh_per_second=5):
+            with Live(table, console=Terminal(), refresh_per_second=5):
                 while not stopped():
                     for text in drain(texts, PAUSE):
                         table.add(text)
@@ -347,16 +349,30 @@ def watch_reports(
 def _stream(texts: "queue.Queue[str]", subscriber: "Subscriber", stopped: Callable[[], bool]) -> None:
     """Print reports as lines; print to standard error what is missing, and the state while no report comes."""
     latest, printed, missed, state = time.monotonic(), "", 0, subscriber.state
+    refused = named = 0
     while not stopped():
         lines = drain(texts, PAUSE)
-        sys.stdout.writelines(f"{line}\n" for line in lines)
-        sys.stdout.flush()
+        refused += _print_objects(lines)
+        if refused != named:
+            named = refused
+            echo(f"{named} messages are not shown: they are no JSON objects, so they are of another program", err=True)
         if subscriber.order.missed != missed:
             missed, (last, end) = subscriber.order.missed, subscriber.order.gap
             remedy = "the daemon no longer has them, see [history] resend_hours"
-            sys.stderr.write(f"reports after number {last} up to {end} are missing: {remedy}; gaps: {missed}\n")
+            echo(f"reports after number {last} up to {end} are missing: {remedy}; gaps: {missed}", err=True)
         if lines:
             latest = time.monotonic()
         elif time.monotonic() - latest > PATIENCE and state() != printed:
             printed = state()
-            sys.stderr.write(f"{printed}\n")
+            echo(printed, err=True)
+
+
+def _print_objects(texts: Iterable[str]) -> int:
+    """Print each text that is a JSON object as one line; return how many are not, as anybody may publish anything."""
+    refused = 0
+    for text in texts:
+        try:
+            echo(checked_line(text))
+        except ValueError:
+            refused += 1
+    return refused

@@ -17,6 +17,7 @@ import click
 
 from otolith.cli.common import DEMOS, SERVICES, local_time
 from otolith.cli.operation.history import Since, age_or_date
+from otolith.cli.terminal import echo
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
@@ -59,9 +60,8 @@ def view(recording: str | None, since: Since | None, only_list: bool, live: bool
     files = [file for file in known.files if begin is None or file.end >= begin]
     if only_list:
         width = max((len(file.key) for file in files), default=0)
-        click.echo("".join(f"{_row(file, width)}\n" for file in files), nl=False)
-        for line in known.unreadable if files else [known.none_text(begin)]:
-            click.echo(line, err=True)
+        echo(*(_row(file, width) for file in files))
+        echo(*(known.unreadable if files else [known.none_text(begin)]), err=True)
         return 0
     if not files:
         raise ConfigurationError(known.none_text(begin))

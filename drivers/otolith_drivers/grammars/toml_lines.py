@@ -3,11 +3,10 @@
 import re
 from typing import Any
 
-from otolith_drivers.outside_text import CONTROL, visible
+from otolith_drivers.outside_text import CONTROL, SURROGATE, visible
 
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 SHOWN = 400  # characters of a comment; engineering choice, three times the longest one of 'otolith probe'
-SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def toml_key(name: str) -> str:

@@ -21,6 +21,7 @@ from weakref import WeakSet
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling, SourceState, sampling_of
 from otolith_drivers.common.reconnection import CLOSE_TIMEOUT, PassingFault, ReconnectBackoff
 from otolith_drivers.errors import DeviceError, OtolithError, shown
+from otolith_drivers.outside_text import visible
 
 log = logging.getLogger(__name__)
 
@@ -346,8 +347,9 @@ def _checked_text(text: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """Return ``text``, cut to what a report can carry."""
-    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"
+    """Return ``text`` as one line, cut to what a report can carry."""
+    line = visible(text, MAX_TEXT)
+    return line if len(text) <= MAX_TEXT else f"{line} ({len(text)} characters)"
 
 
 def _named(error: BaseException) -> str:
