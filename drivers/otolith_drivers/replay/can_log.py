@@ -5,7 +5,6 @@ again behind it, and the line is counted. Its BLF reader hangs on some damaged f
 Formats that it does not read, or reads without checks, are read here: text of tools, and databases.
 """
 
-import heapq
 import io
 import logging
 import math
@@ -16,7 +15,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TextIO, cast
 
@@ -25,12 +23,13 @@ import numpy as np
 from otolith_drivers.base import Sample, Sampling, Setup
 from otolith_drivers.canbus import can
 from otolith_drivers.canbus import driver as can_driver
-from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
+from otolith_drivers.canbus.database import EXTENDED_LIMIT
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CLASSIC_LENGTH
 from otolith_drivers.common.message_times import unix_time
-from otolith_drivers.errors import ConfigurationError, counted, installation_of, some_names
+from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.replay import readers
+from otolith_drivers.replay.mf4 import Mf4Frames
 from otolith_drivers.replay.readers import GZIP, MAX_TIME, DataFile, Reader, Rows, head_of, seen, suffix_of, text_log
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
@@ -46,8 +45,6 @@ CANDUMP_LINE = re.compile(
     r"\((?P<time>[^)]+)\)\s+(?P<channel>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
     r"\s+\[(?P<length>\d{1,2})\](?P<rest>.*)"
 )
-MF4_FRAME = "CAN_DataFrame"  # channel of the frames (ASAM MDF bus logging)
-MF4_CHUNK = 20_000  # frames that are read at once
 SQLITE_COLUMNS = ("ts", "arbitration_id", "extended", "remote", "error", "dlc", "data")
 BLF_OBJECT = struct.Struct("<4sHHLL")  # signature, size and version of the header, size, type
 
@@ -169,67 +166,6 @@ def _frame_of_row(row: tuple[Any, ...]) -> can.Message | str:
         )
     except (TypeError, ValueError) as fault:
         return f"no frame: {fault}"
-
-
-class Mf4Frames:
-    """The frames in an MF4 file that a bus logger wrote (ASAM MDF 4)."""
-
-    place = "frame"
-    passed = 0
-    notes: tuple[str, ...] = ()
-
-    def __init__(self, path: Path, head: bytes) -> None:
-        if not head.startswith(b"MDF ") or path.suffix.lower() == GZIP:
-            kind = seen(head)
-            raise ConfigurationError(f"{path}: is not an unpacked MF4 file{f' but {kind}' if kind else ''}")
-        if find_spec("asammdf") is None:
-            raise ConfigurationError(f"{path}: an MF4 file needs the extra 'mf4': {installation_of('mf4')}")
-        self._path = path
-
-    def frames(self) -> Iterator[tuple[int, can.Message | str]]:
-        """Number of each frame with the frame, or with the reason why there is none; can be iterated once."""
-        from asammdf import MDF  # noqa: PLC0415 - slow to import
-
-        logging.getLogger("asammdf").setLevel(logging.CRITICAL)
-        number = 0
-        try:
-            with MDF(self._path) as file:
-                begun = file.header.start_time.timestamp()
-                names = [[channel.name for channel in group.channels] for group in file.groups]
-                groups = [index for index, group in enumerate(names) if MF4_FRAME in group]
-                if not groups:
-                    signals = [name for group in names for name in group if name not in {"t", "time"}]
-                    yield 1, f"signals ({some_names(signals)}) and no CAN frames: export them as CSV"
-                frames = (_mf4_frames(file, index, begun) for index in groups)
-                for frame in heapq.merge(*frames, key=lambda frame: frame.timestamp):
-                    number += 1
-                    yield number, frame
-        except Exception as error:  # noqa: BLE001 - the library raises anything on damaged data
-            yield number + 1, f"the file is damaged or cut off here: reading ends ({error or type(error).__name__})"
-
-
-def _mf4_frames(file: Any, group: int, begun: float) -> Iterator[can.Message]:
-    """The frames of a channel group; ``begun`` is the Unix time (s) from which its times count."""
-    count = file.groups[group].channel_group.cycles_nr
-    for first in range(0, count, MF4_CHUNK):
-        part = file.get(MF4_FRAME, group, record_offset=first, record_count=min(MF4_CHUNK, count - first))
-        fields = part.samples.dtype.names
-        channels = part[f"{MF4_FRAME}.BusChannel"] if f"{MF4_FRAME}.BusChannel" in fields else None
-        wide = part[f"{MF4_FRAME}.IDE"] if f"{MF4_FRAME}.IDE" in fields else None
-        identifiers, lengths = part[f"{MF4_FRAME}.ID"], part[f"{MF4_FRAME}.DataLength"]
-        data = part[f"{MF4_FRAME}.DataBytes"]
-        for index, time in enumerate(part.timestamps):
-            identifier, length = int(identifiers[index]), int(lengths[index])
-            extended = bool(wide[index]) if wide is not None else identifier > STANDARD_LIMIT
-            yield can.Message(
-                timestamp=begun + float(time),
-                channel=None if channels is None else int(channels[index]),
-                arbitration_id=identifier & EXTENDED_LIMIT,
-                is_extended_id=extended,
-                is_fd=length > CLASSIC_LENGTH,
-                dlc=length,
-                data=data[index][:length].tobytes(),
-            )
 
 
 def open_log(path: Path, setup: Setup, can: Any | None) -> "CanLogReader":

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
+from random import Random
 
 import can
 import numpy as np
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay import can_log
+from otolith_drivers.replay import mf4
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
 from otolith_drivers.replay.tables import TableReader
 from tests.drivers import logs
@@ -287,9 +288,37 @@ def test_an_mf4_file_of_signals_names_them_and_a_damaged_one_is_no_traceback(tmp
     gc.collect()
 
 
+READ_MF4 = """
+import sys
+from pathlib import Path
+from otolith_drivers.replay.mf4 import Mf4Frames
+for path in map(Path, sys.argv[1:]):
+    texts = [text for _, text in Mf4Frames(path, b"MDF ").frames() if isinstance(text, str)]
+    print(*map(repr, texts or ["whole"]))
+"""
+
+
+def test_of_a_damaged_mf4_file_the_library_prints_nothing(tmp_path: Path, frames: Frames) -> None:
+    path, random = written(tmp_path, frames[:300], "MF4"), Random(1)  # noqa: S311 - damage, not a secret
+    content, paths = path.read_bytes(), [path]
+    for number in range(40):
+        damaged = bytearray(content[: random.randrange(64, len(content))] if number % 2 else content)
+        for _ in range(number % 3):
+            damaged[random.randrange(64, min(len(damaged), 3000))] = random.randrange(256)
+        paths.append(tmp_path / f"{number}.mf4")
+        paths[-1].write_bytes(damaged)
+    child = subprocess.run([sys.executable, "-c", READ_MF4, *paths], capture_output=True, text=True, check=True)
+    assert child.stderr == ""
+    first, *lines = child.stdout.splitlines()
+    assert first == "'whole'"
+    assert len(lines) == 40
+    assert sum("damaged or cut off" in line for line in lines) > 10
+    assert all("Traceback" not in line and len(line) < 1000 for line in lines)
+
+
 def test_a_missing_library_for_mf4_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bus.mf4").write_bytes(b"MDF     4.10")
-    monkeypatch.setattr(can_log, "find_spec", lambda _: None)
+    monkeypatch.setattr(mf4, "find_spec", lambda _: None)
     with pytest.raises(ConfigurationError, match=re.escape("pip install 'otolith[mf4]'")):
         read(tmp_path / "bus.mf4")
 
