@@ -321,11 +321,89 @@ HYDRAULIC_ACTUATOR = Plant(
     held=(),
 )
 
+
+def _fan_rates(x: Values, u: Values, q: Values) -> Values:
+    air = q["k_air"] * x["omega"] * np.abs(x["omega"]) * (1.0 + q["air"])
+    return {"omega": (u["T_m"] - air - q["T_c"] * np.tanh(x["omega"] / q["omega_s"]) + q["shaft"]) / q["J"]}
+
+
+def _fan_operation(random: Random, times: Array) -> Values:
+    return {"T_m": levels(random, times, 1.5, 10.0, 4.0)}
+
+
+FAN = Plant(
+    name="fan",
+    twin="fan",
+    period=0.05,
+    records=400,
+    parameters={"k_air": 4e-4, "T_c": 0.6, "J": 0.08, "omega_s": 0.5},
+    sites=("shaft", "air"),
+    initial={"omega": 80.0},
+    rates=_fan_rates,
+    operate=_fan_operation,
+    held=("T_m",),
+)
+
+
+def _electrical_speed(x: Values, u: Values, q: Values) -> Array:
+    speed: Array = q["n_p"] * x["omega"] + q["R_r"] * u["i_q"] / x["psi_r"]
+    return speed
+
+
+def _induction_rates(x: Values, u: Values, q: Values) -> Values:
+    torque = 1.5 * q["n_p"] * x["psi_r"] * u["i_q"] * (1.0 + q["torque"])
+    friction = (q["D"] * x["omega"] + q["T_c"] * np.tanh(x["omega"] / q["omega_s"])) * (1.0 + q["friction"])
+    return {
+        "psi_r": q["R_r"] * (u["i_d"] - x["psi_r"] / q["L_m"]),
+        "omega": (torque - u["T_load"] - friction + q["shaft"]) / q["J"],
+    }
+
+
+def _induction_outputs(x: Values, u: Values, q: Values) -> Values:
+    speed = _electrical_speed(x, u, q)
+    induced = q["R_r"] * (u["i_d"] - x["psi_r"] / q["L_m"])
+    direct = q["R_s"] * u["i_d"] - speed * q["L_sigma"] * u["i_q"] + induced
+    quadrature = q["R_s"] * u["i_q"] + speed * (q["L_sigma"] * u["i_d"] + x["psi_r"])
+    return {"omega": x["omega"], "f_s": speed / (2.0 * np.pi), "v_s": np.hypot(direct, quadrature)}
+
+
+def _induction_operation(random: Random, times: Array) -> Values:
+    """Currents that a speed controller would give, for a load that varies: the speed stays within its range."""
+    swing = smooth(random, times, -1.5, 1.5, 0.8)
+    return {
+        "i_d": smooth(random, times, 3.6, 4.2, 4.0),
+        "i_q": 2.3 + swing,
+        "T_load": 5.0 + smooth(random, times, -0.5, 0.5, 1.0),
+    }
+
+
+INDUCTION_MOTOR = Plant(
+    name="induction_motor",
+    twin="induction_motor",
+    parameters={
+        "R_s": 3.7,
+        "R_r": 2.1,
+        "L_m": 0.224,
+        "L_sigma": 0.021,
+        "n_p": 2.0,
+        "J": 0.0155,
+        "D": 0.001,
+        "T_c": 0.3,
+        "omega_s": 0.5,
+    },
+    sites=("shaft", "torque", "friction"),
+    initial={"psi_r": 0.88, "omega": 100.0},
+    rates=_induction_rates,
+    outputs=_induction_outputs,
+    operate=_induction_operation,
+    held=(),
+)
+
 LIBRARY_PLANTS = {
     plant.name: plant
     for plant in (
         *(DC_MOTOR, DC_MOTOR_COULOMB, PUMP, HYDRAULIC_ACTUATOR),
-        *(PMSM, SERVO_AXIS, SERVO_AXIS_DIRECTIONAL, TWO_MASS),
+        *(PMSM, SERVO_AXIS, SERVO_AXIS_DIRECTIONAL, TWO_MASS, FAN, INDUCTION_MOTOR),
     )
 }
 

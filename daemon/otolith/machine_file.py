@@ -19,9 +19,9 @@ from otolith.health.diagnosis import OwnRule
 from otolith.health.schema import Language
 from otolith.twin.definition import Definition
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
+from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.guard import GuardedSource
 from otolith_drivers.sources import SeveralSources
 from otolith_drivers.units import Quantity
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import astuple
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, SourceState, sampling_of
+from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.reconnection import CLOSE_TIMEOUT
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.guard import GuardedSource
 
 
 class SeveralSources:

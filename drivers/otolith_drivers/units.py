@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +109,19 @@ SYMBOLS = {
 """What people write by the pattern of what files write: in formulas, and in units besides."""
 
 
+# Engineering choices, see docs/reference/thresholds-drivers.md.
+PLAIN_NUMBERS = 1e-3, 1e5  # between which a number whose unit takes no prefix is read without a power of ten
+PLAIN_QUANTITIES = 0.1, 1e4  # the same without a prefix
+MAX_ZEROS, MAX_DECIMALS = 6, 8  # of a number beside one of another size
+PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+SMALL = {exponent: prefix for exponent, prefix in PREFIXES.items() if exponent <= 0}
+PREFIXED = {
+    r"(?:[NVAΩWJHFTCS]|Hz|Pa|Wb)(?![^\W\d_]|[²³^\d])": PREFIXES,
+    r"(?:[ms]|bar)(?![^\W\d_]|[²³^\d])": SMALL,
+}
+"""The prefixes of a unit by its first symbol; others are read without, as rad/s and kg·m²."""
+
+
 class UnitNameError(ValueError):
     """A text names no unit, or leaves open which."""
 
@@ -141,6 +155,63 @@ def equation_text(written: str) -> str:
     """Return the equation of a component as people write it; a unit may stand behind its last space."""
     formula, space, unit_of_it = written.rpartition(" ")
     return f"{formula_text(formula)} {unit_text(unit_of_it)}" if space else formula_text(written)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The power of ten and the unit in which a number and those beside it are written."""
+
+    exponent: int
+    unit: str  # With its prefix; empty for a plain number
+    mark: str = ""  # Behind each number, like e-6, if its unit takes no prefix
+
+    def number(self, value: float, digits: int = 5) -> str:
+        """Return a number with at most ``digits`` significant digits."""
+        text = f"{value / 10.0**self.exponent + 0.0:.{digits}g}"
+        if "e" in text:  # beside a number of another size
+            text = f"{Decimal(text):f}" if abs(int(text.partition("e")[2])) <= MAX_ZEROS else _power_of_ten(text)
+        return text if text in {"0", "-0"} else f"{text}{self.mark}"
+
+    def numbers(self, value: float, half: float | None) -> tuple[str, str]:
+        """Return a value and half of its interval, rounded to the two digits of this; empty without an interval."""
+        if half is None or not (0.0 < half < math.inf and math.isfinite(value)):
+            return self.number(value), "" if half is None else self.number(half)
+        value, half = value / 10.0**self.exponent, half / 10.0**self.exponent
+        decimals = 1 - math.floor(math.log10(float(f"{half:.1e}")))
+        if decimals > MAX_DECIMALS:
+            return self.number(value * 10.0**self.exponent), self.number(half * 10.0**self.exponent, 2)
+        shown = (f"{round(number, decimals) + 0.0:.{max(decimals, 0)}f}{self.mark}" for number in (value, half))
+        return next(shown), next(shown)
+
+
+def scale_of(value: float, unit: str) -> Scale:
+    """Return how a number of the size of ``value`` is written in a ``unit`` of a file."""
+    symbol, size = unit_text(unit), abs(value)
+    prefixes = next((table for pattern, table in PREFIXED.items() if re.match(pattern, symbol)), None)
+    low, high = PLAIN_NUMBERS if prefixes is None else PLAIN_QUANTITIES
+    if not 0.0 < size < math.inf or low <= size < high:
+        return Scale(0, symbol)
+    exponent = 3 * math.floor(math.log10(size) / 3.0)
+    if prefixes is None:
+        return Scale(exponent, symbol, f"e{exponent}")
+    exponent = min(max(exponent, min(prefixes)), max(prefixes))
+    return Scale(exponent, f"{prefixes[exponent]}{symbol}")
+
+
+def quantity_text(value: float, unit: str, half: float | None = None, digits: int = 5) -> str:
+    """Return a value, half of its interval and their ``unit`` of a file as people read them.
+
+    ``4.681 ± 0.041 mN·m``: both are rounded to two digits of the interval. Without one, or with one of 0, the value has
+    at most ``digits`` significant digits.
+    """
+    scale = scale_of(max(abs(value), half or 0.0), unit)
+    numbers = (scale.number(value, digits),) if half is None else scale.numbers(value, half)
+    return " ".join(filter(None, (" ± ".join(numbers), scale.unit)))
+
+
+def _power_of_ten(text: str) -> str:
+    digits, _, exponent = text.partition("e")
+    return f"{digits}e{int(exponent)}"
 
 
 def _replaced(text: str, symbols: Mapping[str, str]) -> str:

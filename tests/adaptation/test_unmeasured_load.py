@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.changes.machines import LIBRARY_PLANTS, REVERSING_MOTOR
+from benchmarks.changes.machines import INDUCTION_MOTOR, LIBRARY_PLANTS, REVERSING_MOTOR
 from benchmarks.changes.plants import HEALTHY, Plant, Values, generator, simulate
 
 from otolith.acquisition.window import Array, Window
@@ -89,6 +89,8 @@ CASES = (
     Case("pmsm, constant", PMSM, Assumption.CONSTANT, lambda _: 1.5, {"T_load": 1.5}),
     Case("pmsm, squared", PMSM, Assumption.PROPORTIONAL, lambda x: 1e-3 * x["omega"] * np.abs(x["omega"]),
          {"T_load_factor": 1e-3}, "omega*abs(omega)"),
+    Case("induction_motor, squared", INDUCTION_MOTOR, Assumption.PROPORTIONAL,
+         lambda x: 5e-4 * x["omega"] * np.abs(x["omega"]), {"T_load_factor": 5e-4}, "omega*abs(omega)"),
     Case("two_mass, friction", reversing(TWO_MASS, "T_m", 3.0), Assumption.FRICTION, dry(0.2, 0.5, "omega_l"),
          {"T_load_dry": 0.2, "T_load_speed": 0.5}),
 )  # fmt: skip

@@ -53,7 +53,7 @@ def test_the_table_has_values_events_and_findings(written: HistoryWriter, is_run
     assert lines[0].startswith(f"{MACHINE} at {SITE}, since ")
     assert lines[0].endswith("values per minute")
     (row,) = [line for line in lines if "R_a" in line and "│" in line]
-    assert [cell.strip() for cell in row.split("│")][1:6] == ["R_a", "6.5004", "0.02", "Ω", "+0.01%"]
+    assert [cell.strip() for cell in row.split("│")][1:6] == ["R_a", "6.500", "0.020", "Ω", "+0.01%"]
     assert "▁" in row
     assert "█" in row
     text = " ".join(lines)
@@ -78,7 +78,7 @@ def test_a_narrow_terminal_cuts_no_number(written: HistoryWriter, width: int) ->
     del written
     text = run(MACHINE, width=width).stdout
     assert "…" not in text
-    assert re.search(r"R_a\W+6\.5004\W+0\.02\W+Ω\W+0\.01%.*█", text)  # on one line
+    assert re.search(r"R_a\W+6\.500\W+0\.020\W+Ω\W+0\.01%.*█", text)  # on one line
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])

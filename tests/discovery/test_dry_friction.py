@@ -40,6 +40,13 @@ def test_dry_friction_on_the_load_of_two_masses_stays_alone_for_a_minute() -> No
     assert {item.id for document in documents for item in document.components} == {component.id}
 
 
+@pytest.mark.parametrize("phase", [1.5 - 2.0 * np.pi, 1.5, 1.5 + 14.0 * np.pi])
+def test_a_phase_is_written_within_one_turn(phase: float) -> None:
+    """The filter lets it grow: a reader would take each turn for a change."""
+    component = Component("shaft", "periodic", "t", 0.001, 20.0, phase)
+    assert equation(TWIN, component, [0.001, 20.0, phase]) == "0.001·sin(20·t + 1.50) N*m"
+
+
 def test_a_negative_rate_is_written_with_one_sign() -> None:
     component = Component("shaft", "negative exponential", "i", 0.001, 0.1)
     assert equation(TWIN, component, [0.001, -0.0008]) == "0.001·exp(0.0008·i) N*m"

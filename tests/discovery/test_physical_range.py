@@ -26,7 +26,8 @@ from tests.discovery.two_mass import problem as two_mass_problem
 
 TWIN = problem().base_model
 KNOWN = Prior(np.concatenate([problem().nominal, np.zeros(2)]), np.diag([0.01, 2e-6, 1e-4, 1e-8]) ** 2)
-LIBRARY = ("dc_motor", "dc_motor_coulomb", "hydraulic_actuator", "pmsm", "pump", "servo_axis", "two_mass")
+LIBRARY = ("dc_motor", "dc_motor_coulomb", "fan", "hydraulic_actuator", "induction_motor", "pmsm", "pump", "servo_axis",
+           "two_mass")  # fmt: skip
 Torque = Callable[[float, float, float, float, float, float], float]
 
 

@@ -15,10 +15,10 @@ import pytest
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Window
 from otolith.health.status import absent_sources, driver_document
-from otolith_drivers import guard
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
+from otolith_drivers.common import guard
+from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.errors import ConfigurationError, DeviceError
-from otolith_drivers.guard import GuardedSource
 from otolith_drivers.sources import SeveralSources
 from tests.waiting import PATIENCE, wait_for
 

@@ -16,9 +16,9 @@ from otolith.health.schema import ParameterDocument, Status
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
+from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.conformance import CONTRACT, Rig
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.guard import GuardedSource
 from otolith_drivers.sources import SeveralSources
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import RIGS

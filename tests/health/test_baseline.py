@@ -81,7 +81,7 @@ def test_the_command_takes_the_saved_estimates(
     state = initial_state(names.name, names.site, machine.problem, machine.plan)
     store.save(replace(state, health=HealthState(histories={"R_a": history(7.0, 50)})))
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert "baseline R_a = 7 Ω ± 0.028, mean of 50 estimates" in result.output
+    assert "baseline R_a = 7.000 ± 0.028 Ω, mean of 50 estimates" in result.output
     assert "beyond its limit" not in result.output
     assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
     store.save(replace(state, health=HealthState(histories={"R_a": history(5.9, 50)})))

@@ -355,7 +355,7 @@ def test_a_known_parameter_that_has_moved_is_judged_by_the_limits_of_the_twin(
     if expected:
         event = events(documents[-1])["magnets"]
         assert event.condition == "the magnetic field of the motor has dropped at once"
-        assert "0.034 N·m/A ± 0.00002 (-10.5%), stated as 0.038" in event.text
+        assert "34.000 ± 0.020 mN·m/A (-10.5%), stated as 38 mN·m/A" in event.text
 
 
 def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:

@@ -104,7 +104,7 @@ def test_a_machine_without_events_is_ok_and_there_is_nothing_to_do() -> None:
 def test_one_window_is_a_point() -> None:
     shown = page(written(reports(1)), now=START + 2.0)
     assert "polyline" in shown.elements
-    assert "6.5 Ω ± 0.02" in shown.text
+    assert "6.500 ± 0.020 Ω" in shown.text
 
 
 def test_a_history_without_a_report_is_no_data() -> None:
@@ -238,7 +238,7 @@ COUNTS = {"degrading": 55, "unbalance": 40, "sensor-fault": 48}
 """Windows of each simulated situation: shortly after what is announced last."""
 ANNOUNCED = {
     "degrading": ("WATCH winding: short circuit between turns", "reaches ACT in", "measure resistance and insulation"),
-    "unbalance": ("ACT shaft: unbalanced shaft", "amplitude", "balance the rotor", "+ (1/J)·U1", "ACT 0.004"),
+    "unbalance": ("ACT shaft: unbalanced shaft", "amplitude", "balance the rotor", "+ (1/J)·U1", "ACT 4", "mN·m"),
     "sensor-fault": ("ACT sensors: a sensor is wrong", "check the sensor and its cable", "R_a, D : not estimated in"),
 }
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import open_recorded
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay import recording as recording_module
 from otolith_drivers.replay.recording import RecordingReader
 from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
 from tests.messages import assert_refuses, raises_saying
@@ -162,13 +164,48 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
 
 
 def test_ctrl_c_does_not_call_a_recording_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A terminal signals the process group; the child that tries the file is in another one."""
-    tested = "import os; os.kill(os.getpid(), 0 if os.getpgrp() != os.getpgid(os.getppid()) else 9)"
-    monkeypatch.setattr("otolith_drivers.replay.recording.READ_ALL", tested)
+    """A terminal signals the process group; the child that reads the file is in another one."""
+    monkeypatch.setattr(recording_module, "READ_IN_CHILD", [sys.executable, "-c", CHILD_IN_OTHER_GROUP])
     path = tmp_path / "empty.rrd"
     path.touch()
-    with pytest.raises(ConfigurationError, match="file too small"):
+    with pytest.raises(ConfigurationError, match="another group"):
         RecordingReader(path, {})
+
+
+CHILD_IN_OTHER_GROUP = """
+import os, struct, sys
+text = b"another group" if os.getpgrp() != os.getpgid(os.getppid()) else b"the same group"
+sys.stdout.buffer.write(struct.pack("<cIf", b"F", len(text), 0.0) + text)
+"""
+
+
+def test_a_child_that_aborts_is_a_damaged_file_and_costs_nothing_else(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_module, "READ_IN_CHILD", [sys.executable, "-c", "import os; os.abort()"])
+    with raises_saying(ConfigurationError, "run.rrd", "aborts", "rerun rrd optimize"):
+        RecordingReader(recording, UNITS)
+
+
+def test_a_recording_is_read_by_one_child_which_ends_with_its_reader(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Counted(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **keys: Any) -> None:
+            super().__init__(*arguments, **keys)
+            started.append(self)
+
+    monkeypatch.setattr(recording_module.subprocess, "Popen", Counted)  # type: ignore[attr-defined]
+    with RecordingReader(recording, UNITS) as reader:
+        (child,) = started
+        assert 0.0 <= reader.progress < 1.0 or reader.progress == pytest.approx(1.0)
+        assert sum(len(rows.times) for rows in reader.chunks()) == 2 * RECORDS or reader.summary_lines()
+        assert reader.progress == 1.0
+    assert child.returncode is not None
+    assert len(started) == 1
+    assert "rerun" not in vars(recording_module)
 
 
 def test_a_recording_of_another_application_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
 from tests.twin.reference import Reference
 
-PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "hydraulic_actuator": 0.01, "pmsm": 5e-4, "pump": 0.02,
+PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "fan": 0.05, "hydraulic_actuator": 0.01,
+           "induction_motor": 0.01, "pmsm": 5e-4, "pump": 0.02,
            "servo_axis": 1e-3, "servo_axis_directional": 1e-3, "two_mass": 2e-3}  # fmt: skip
 RECORDS = 60
 

@@ -30,7 +30,7 @@ from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of
+from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of, wrapped
 from otolith.estimation.window_fit import WindowEstimate
 from otolith.health.schema import (
     AlternativeDocument,
@@ -301,6 +301,7 @@ def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, Nu
     values = {}
     for name, at in zip(("amplitude", inner_name, "phase"), indices(problem, slot), strict=False):
         value, sd = float(known.mean[at]), float(deviations[at])
+        value = wrapped(value) if name == "phase" and component.periodic else value
         values[name] = _number(value, sd, problem.free[at].unit)
     return values
 

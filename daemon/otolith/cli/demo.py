@@ -29,7 +29,7 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.cli.terminal import echo_json
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import announcements, event_text, headline, number_text, number_texts, summary
+from otolith.health.text import announcements, event_text, headline, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -40,7 +40,7 @@ from otolith.storage.recording_files import STAMP
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
-from otolith_drivers.units import equation_text, unit_text
+from otolith_drivers.units import equation_text, quantity_text, scale_of
 from otolith_drivers.user_dirs import state_directory, writable
 
 # The verdict. Engineering choices; tests/system/test_main_job.py runs the demo and asserts the same TOLERANCE.
@@ -355,15 +355,15 @@ class Demo:
         table = Table(title=f"injected and estimated, good windows with excitation{every}")
         for column in ("window", "parameter", "injected", "estimated ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
-        units = {parameter.name: unit_text(parameter.unit) for parameter in self._machine.problem.free}
+        units = {parameter.name: parameter.unit for parameter in self._machine.problem.free}
         last = [] if (len(rows) - 1) % step == 0 else rows[-1:]
         for row in [*rows[::step], *last]:
-            text, error, style = "unknown", "", None
+            text, error, style, scale = "unknown", "", None, scale_of(row.injected, units[row.parameter])
             if row.estimated is not None:
-                text, error = " ± ".join(number_texts(row.estimated, QUANTILE * row.sd)), f"{row.error:.3%}"
+                text, error = " ± ".join(scale.numbers(row.estimated, QUANTILE * row.sd)), f"{row.error:.3%}"
                 style = "red" if row.wrong else None
-            injected, unit = number_text(row.injected), units[row.parameter]
-            table.add_row(str(row.window), row.parameter, injected, text, unit, error, style=style)
+            injected = scale.number(row.injected)
+            table.add_row(str(row.window), row.parameter, injected, text, scale.unit, error, style=style)
         return table
 
     def _print_changes(self, rows: list[Comparison]) -> None:
@@ -373,8 +373,8 @@ class Demo:
             errors = [row.error for row in own if row.estimated is not None]
             if errors:
                 before, after = own[0].injected, own[-1].injected
-                values = f"from {number_text(before)} to {number_text(after)} {unit_text(parameter.unit)}"
-                change = f"{values} ({after / before - 1:+.1%})"
+                values = " to ".join(quantity_text(value, parameter.unit) for value in (before, after))
+                change = f"from {values} ({after / before - 1:+.1%})"
                 error = f"largest error {max(errors):.3%} in {len(errors)} windows"
                 self._print(f"{parameter.name} went {change}; {error}")
 

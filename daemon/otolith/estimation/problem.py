@@ -3,6 +3,7 @@
 The twin is augmented: it has components in its slots (Eq. 3 of the paper).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -286,10 +287,16 @@ def slot_of(problem: Problem, component: Component) -> int | None:
     return keys.index(component.key) if component.key in keys else None
 
 
+def wrapped(phase: float) -> float:
+    """Return a phase in (−π, π]: the filter lets it grow beyond."""
+    return math.pi - (math.pi - phase) % math.tau if math.isfinite(phase) else phase
+
+
 def equation(twin: Definition, component: Component, values: Sequence[float]) -> str:
     """Return the component as text; ``values`` are amplitude, inner parameter and phase as far as it has them."""
     rest = [*values[1:], 0.0, 0.0]
-    phase = f"{'-' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
+    angle = wrapped(rest[1]) if component.periodic else rest[1]
+    phase = f"{'-' if angle < 0.0 else '+'} {abs(angle):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)
     text = text.replace("--", "")  # exp(--0.1·x) is exp(0.1·x)
     site = site_of(twin, component.site)

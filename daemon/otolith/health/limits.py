@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from otolith.estimation.information import QUANTILE
+from otolith_drivers.units import quantity_text
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
 MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
@@ -83,7 +84,7 @@ class MonitoredQuantity:
     @property
     def limits_text(self) -> str:
         """The limits in words; empty without one."""
-        texts = (f"{item.level} {item.side} {item.value:.5g} {self.unit}" for item in self.limits)
+        texts = (f"{item.level} {item.side} {quantity_text(item.value, self.unit)}" for item in self.limits)
         return ", ".join(texts)
 
     def level(self, value: float, sd: float, before: Level) -> tuple[Level, Limit | None]:

@@ -17,8 +17,8 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
-from otolith.health.text import Texts, duration_text, forecast_text, interval_text, number_text, value_text
-from otolith_drivers.units import equation_text, unit_text
+from otolith.health.text import Texts, duration_text, forecast_text, interval_text, value_text
+from otolith_drivers.units import equation_text, quantity_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
 INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
@@ -151,7 +151,7 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
         change = f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else ""
         what = {"what": plan.texts.translated(quantity.meaning), "name": finding.subject, "change": change}
         interval = interval_text(value.value, value.sd, value.unit)
-        text = plan.texts("moved", **what, value=interval, stated=number_text(quantity.nominal))
+        text = plan.texts("moved", **what, value=interval, stated=quantity_text(quantity.nominal, value.unit))
     persistence = PERSISTENCE.get(finding.kind, Persistence())
     return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
 
@@ -189,7 +189,7 @@ def _of_parameter(
 def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
     """Return on which side of a limit a value is."""
     side = texts(limit.side if limit.excess(value) > 0.0 else "still_near")
-    return texts("beside", side=side, limit=f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip())
+    return texts("beside", side=side, limit=quantity_text(limit.value, unit, digits=4))
 
 
 def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, span: float) -> Observation:

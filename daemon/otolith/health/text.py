@@ -6,12 +6,10 @@ in braces, and a sentence that it matches becomes its translation, with the part
 stays English.
 """
 
-import math
 import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
-from decimal import Decimal
 from functools import lru_cache
 from importlib.resources import files
 
@@ -30,12 +28,10 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
-from otolith_drivers.units import equation_text, unit_text
+from otolith_drivers.units import equation_text, quantity_text, scale_of, unit_text
 
 UNKNOWN = "unknown"
 UNKNOWN_STATE = "UNKNOWN"
-PLAIN_NUMBERS = 1e-3, 1e5  # between which a number is read without a power of ten; engineering choice
-MAX_ZEROS = 6  # of decimals that an interval has beside its value; engineering choice
 ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
 PARTS = "; "
 MAX_SENTENCE = 500  # characters: the time of a match grows with a high power of them, and a device may write the text
@@ -89,41 +85,9 @@ def _pattern(phrase: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)
 
 
-def number_text(value: float, digits: int = 5) -> str:
-    """A number with at most ``digits`` significant digits: ``6.5``, ``0.0014296``, ``14.296e-6``."""
-    return _scaled_text(value, digits, _exponent(value))
-
-
-def number_texts(value: float, half: float | None) -> tuple[str, str]:
-    """A value and half of its interval, in the same power of ten; without an interval its text is empty."""
-    exponent = _exponent(max(abs(value), half or 0.0))
-    return _scaled_text(value, 5, exponent), "" if half is None else _scaled_text(half, 2, exponent)
-
-
-def _exponent(value: float) -> int:
-    """A multiple of three, as in the prefixes of units; 0 for numbers that are read without it."""
-    is_plain = value == 0.0 or not math.isfinite(value) or PLAIN_NUMBERS[0] <= abs(value) < PLAIN_NUMBERS[1]
-    return 0 if is_plain else 3 * math.floor(math.log10(abs(value)) / 3.0)
-
-
-def _scaled_text(value: float, digits: int, exponent: int) -> str:
-    text = f"{value / 10.0**exponent:.{digits}g}"
-    if "e" in text:  # beside a number of another size
-        if abs(_exponent(value) - exponent) > MAX_ZEROS:
-            return number_text(value, digits)
-        text = f"{Decimal(text):f}"
-    return f"{text}e{exponent}" if exponent and text != "0" else text
-
-
-def half_width_text(sd: float) -> str:
-    """Half of the 95 % interval of a normal distribution with standard deviation ``sd``."""
-    return number_text(QUANTILE * sd, 2)
-
-
 def interval_text(value: float, sd: float, unit: str) -> str:
-    """A value with its 95 % interval: ``5.9856 Ω ± 0.0075``."""
-    number, half = number_texts(value, QUANTILE * sd)
-    return " ".join(filter(None, (number, unit_text(unit), "±", half)))
+    """A value with its 95 % interval: ``5.9856 ± 0.0075 Ω``; ``sd`` is its standard deviation."""
+    return quantity_text(value, unit, QUANTILE * sd)
 
 
 def value_text(parameter: ParameterDocument) -> str:
@@ -139,7 +103,9 @@ def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
         return UNKNOWN, "", unit_text(parameter.unit), ""
     change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
     change = "0.00%" if change in ("-0.00%", "+0.00%") else change
-    return *number_texts(parameter.value, QUANTILE * parameter.sd), unit_text(parameter.unit), change
+    half = QUANTILE * parameter.sd
+    scale = scale_of(max(abs(parameter.value), half), parameter.unit)
+    return *scale.numbers(parameter.value, half), scale.unit, change
 
 
 def parameter_text(name: str, parameter: ParameterDocument) -> str:

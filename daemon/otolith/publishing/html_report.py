@@ -21,13 +21,14 @@ from markupsafe import Markup
 
 from otolith import __version__
 from otolith.acquisition.quality import is_of_calendar
+from otolith.estimation.information import QUANTILE
 from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import Texts, texts_in
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
 from otolith_drivers.outside_text import visible
-from otolith_drivers.units import equation_text, formula_text
+from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
 SILENT_WINDOWS = 3  # lengths of a window without a report until the state is NO DATA
@@ -44,7 +45,8 @@ STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 4
          604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
 WHOLE = re.compile(  # a date; a number with its interval and a short unit
     r"(\d{4}-\d\d-\d\d(?: [\d:.]+)?"
-    r"|\d[\d.]*(?:e-?\d+)?(?: [^\s\d.,;()±]{1,11}(?= ±))?(?: ± [\d.e-]+)?(?: (?:%|°C|[ΩAVWNs]\b))?)"
+    r"|\d[\d.]*(?:e-?\d+)? ± [\d.e-]+(?: [^\s\d.,;()±]{1,11})?"
+    r"|\d[\d.]*(?:e-?\d+)?(?: (?:%|°C|[pnµmkMG]?[ΩAVWN]\b|[nµm]?s\b))?)"
 )
 UNBROKEN = Markup('<span class="whole">{}</span>')
 MAX_WHOLE = 26  # characters: a line of a phone in the type of a value; engineering choice
@@ -106,6 +108,7 @@ class Curve:
     limits: tuple[tuple[Level, float, bool], ...]  # Level, value, and whether values below it are beyond it
     last: HistorySample | None
     away: Mapping[str, float]  # Percent of the windows with another status than estimated
+    scale: Scale  # In which its present value and all beside it are written
     plot: Mapping[str, Sequence[Any]] | None = None
     """``band``: polygons of the 95 % interval; ``lines``: whether the value was estimated then, and points; ``marks``;
     ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""
@@ -143,7 +146,7 @@ def html_report(
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
     own = {"when": _time_of_day if is_of_calendar(axis.begin) else text.moment_text, "words": say.translated}
-    environment.filters |= vars(text) | own | {"whole": whole}
+    environment.filters |= vars(text) | own | {"whole": whole, "quantity_text": quantity_text}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
     is_over = latest is not None and now <= latest.window.end
@@ -251,9 +254,19 @@ def _curves(
         for row in same:
             counts[row.status] += row.count
         away = {name: 100.0 * count / counts.total() for name, count in counts.items() if name not in TRUSTED}
-        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away)
+        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away, _scale(parameter, same))
         points = list(_thinned(axis, same))
         yield replace(curve, plot=_plot(axis, gaps, points, curve)) if points else curve
+
+
+def _scale(parameter: ParameterDocument | None, samples: Sequence[HistorySample]) -> Scale:
+    """Return how the numbers of a curve are written, by its present value; by its nominal value if it has none."""
+    if parameter is not None:
+        half = QUANTILE * (parameter.sd or 0.0)
+        return scale_of(
+            parameter.nominal if parameter.value is None else max(abs(parameter.value), half), parameter.unit
+        )
+    return scale_of(samples[-1].last, samples[-1].unit) if samples else Scale(0, "")
 
 
 def _thinned(axis: Axis, samples: Iterable[HistorySample]) -> Iterator[HistorySample]:

@@ -31,7 +31,6 @@ from otolith.health.text import (
     forecast_text,
     headline,
     moment_text,
-    number_text,
     probability_text,
     state_word,
     texts_in,
@@ -42,7 +41,7 @@ from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SH
 from otolith.twin.definition import Input, Output
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.replay.recording import packed
-from otolith_drivers.units import equation_text, unit_text
+from otolith_drivers.units import equation_text, quantity_text, unit_text
 
 APPLICATION = "otolith"
 TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
@@ -181,13 +180,13 @@ class Recording:
         times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays), "signals": units})
         self._stream.log(TIMES, rr.TextDocument(times), static=True)
         for signal in twin.inputs:
-            self._style(f"signals/{signal.name}", [quantity_text(f"{signal.name} measured", signal.unit)], [MEASURED])
+            self._style(f"signals/{signal.name}", [named_with_unit(f"{signal.name} measured", signal.unit)], [MEASURED])
         for output in twin.outputs:
-            names = [quantity_text(f"{output.name} {kind}", output.unit) for kind in ("measured", "twin")]
+            names = [named_with_unit(f"{output.name} {kind}", output.unit) for kind in ("measured", "twin")]
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
         self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
         for parameter in source.parameters:
-            names = [*INTERVAL, quantity_text(parameter.name, parameter.unit)]  # the last is drawn on top
+            names = [*INTERVAL, named_with_unit(parameter.name, parameter.unit)]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, MEASURED])
             quantity = source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
             self._limits[parameter.name], lines = quantity, limit_lines(quantity, source.plan.texts)
@@ -263,7 +262,7 @@ class Recording:
             # '/' and brackets have a meaning in the path of an entity.
             entity = "components/" + re.sub(r"\W+", "_", component.id)
             if entity not in self._styled:
-                what = quantity_text(f"{component.meaning}, {component.family}", amplitude.unit)
+                what = named_with_unit(f"{component.meaning}, {component.family}", amplitude.unit)
                 self._style(entity, [*INTERVAL, what], [LIMIT, LIMIT, MEASURED])
                 self._styled.add(entity)
             self._add_row(entity, end, amplitude.low, amplitude.high, amplitude.value)
@@ -368,10 +367,12 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     """Return name, value and colour of the lines beside a parameter: nominal value and limits, the nearest first."""
     limits = sorted(quantity.limits, key=lambda row: abs(row.value - quantity.nominal))
     rows = [("nominal", quantity.nominal, LIMIT), *((str(row.level), row.value, STATES[row.level]) for row in limits)]
-    return [(f"{texts.translated(name)} {number_text(value, 4)}", value, colour) for name, value, colour in rows]
+    values = (quantity_text(value, quantity.unit, digits=4) for _, value, _ in rows)
+    named = zip(rows, values, strict=True)
+    return [(f"{texts.translated(name)} {shown}", value, colour) for (name, value, colour), shown in named]
 
 
-def quantity_text(name: str, unit: str) -> str:
+def named_with_unit(name: str, unit: str) -> str:
     """Return the name of a quantity with its unit in brackets, if it has one."""
     return f"{name} [{symbol}]" if (symbol := unit_text(unit)) else name
 
@@ -462,7 +463,7 @@ def _operator(source: RecordedMachine) -> rrb.Container:
     estimates = [
         rrb.TimeSeriesView(
             contents=[f"/parameters/{row.name}", f"/limits/{row.name}"],
-            name=f"{quantity_text(row.name, row.unit)}: {say(row.meaning)}",
+            name=f"{named_with_unit(row.name, row.unit)}: {say(row.meaning)}",
             axis_x=whole,
             plot_legend=rrb.PlotLegend(_legend_corner(source.plan.parameters.get(row.name, MonitoredQuantity()))),
         )
@@ -498,7 +499,7 @@ def _engineer(source: RecordedMachine) -> rrb.Container:
     """Curves of signals and twin, residuals, the report and the log."""
     series, twin, texts = rrb.TimeSeriesView, source.twin, source.plan.texts
     signals: tuple[Output | Input, ...] = (*twin.outputs, *twin.inputs)
-    names = {row.name: quantity_text(texts.translated(row.meaning), row.unit) for row in signals}
+    names = {row.name: named_with_unit(texts.translated(row.meaning), row.unit) for row in signals}
     outputs = [
         series(origin=f"/signals/{row.name}", name=f"{names[row.name]}: {texts('measured_and_twin')}")
         for row in twin.outputs

@@ -87,7 +87,7 @@ def without_sensor(definition: Definition, item: UnmeasuredInput) -> Definition:
         case Assumption.FRICTION:
             changed = _with_friction(definition, rest, driven)
         case Assumption.PROPORTIONAL:
-            factor = _factor(rest, driven, item.expression, "factor", "per")
+            factor = _factor(rest, driven, item.expression, "factor", "factor of")
             changed = _with_terms(rest, driven, [f"{factor.name}*({item.expression})"], [factor])
     taken = rest.units().keys() | {name for name, _, _ in rest.definitions}
     for parameter in changed.parameters[len(rest.parameters) :]:
@@ -137,7 +137,7 @@ def _factor(rest: Definition, driven: Input, expression: str, suffix: str, what:
     if not 0.0 < least < usual < np.inf:
         raise ValueError(f"{expression!r} does not grow with a state or an input: write one that does, like 'omega^2'")
     largest = _largest(driven.low, driven.high) * to_base(driven.unit)[0]
-    meaning = f"{driven.meaning} {what} {expression}"
+    meaning = f"{what} {driven.meaning}"
     name = f"{driven.name}_{suffix}"
     return Parameter(name, unit, largest / usual, -largest / least, largest / least, meaning, Role.ESTIMATED)
 
@@ -162,7 +162,7 @@ def _with_friction(definition: Definition, rest: Definition, driven: Input) -> D
     terms: list[str] = []
     added: list[Parameter] = []
     if not frictions.viscous:
-        factor = _factor(rest, driven, speed.name, "viscous", "per")
+        factor = _factor(rest, driven, speed.name, "viscous", "viscous friction in")
         added.append(replace(factor, low=0.0))
         terms.append(f"{factor.name}*{speed.name}")
     if not frictions.dry:

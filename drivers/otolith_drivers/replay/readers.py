@@ -9,10 +9,9 @@ import math
 import re
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -41,7 +40,8 @@ BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is reco
 # Formats by the end of the file name. The module is imported only when a file asks for it.
 CAN_LOG = "otolith_drivers.replay.can_log"
 READERS = dict.fromkeys((".asc", ".blf", ".db", ".log", ".mf4", ".trc"), CAN_LOG)
-READERS[".rrd"] = "otolith_drivers.replay.recording"
+RECORDING, RECORDING_HEAD = ".rrd", b"RRF"
+READERS[RECORDING] = "otolith_drivers.replay.recording"
 TABLE = "otolith_drivers.replay.tables"  # all other files
 
 # Formats by the first bytes: text logs of a CAN bus, and what a refusal names.
@@ -70,7 +70,7 @@ OTHERS = {
     "Vector BLF": rb"LOGG",
     "MDF (MF4)": rb"MDF ",
     "SQLite": rb"SQLite format 3\x00",
-    "a recording of Rerun": rb"RRF",
+    "a recording of Rerun": RECORDING_HEAD,
     "a spreadsheet or another ZIP archive": rb"PK\x03\x04",
     "HDF5 or MATLAB 7.3": rb"\x89HDF",
     "MATLAB 5": rb"MATLAB 5",
@@ -318,81 +318,102 @@ class _TruncatedGzip(io.RawIOBase):
         super().close()
 
 
-class ReaderGroup(Reader):
-    """Several files as one; a file that cannot be opened is named before any is read."""
+class JoinedReader(Reader):
+    """Reads files one after the other, in the order given, of which one is open at a time."""
 
-    def __init__(self, path: Path, opening: Iterable[tuple[str, Callable[[], Reader]]]) -> None:
-        """``opening`` has a title for each file and what opens it; ``path`` stands for all files in messages."""
-        super().__init__(path)
-        with ExitStack() as opened:
-            self._readers = [(title, opened.enter_context(open_file())) for title, open_file in opening]
-            self._opened = opened.pop_all()
-        self.place = f"its file's {self._readers[0][1].place}"
-        self.ignored = tuple(dict.fromkeys(name for _, reader in self._readers for name in reader.ignored))
+    def __init__(self, paths: Sequence[Path], open_file: Callable[[Path], Reader]) -> None:
+        """Try all files; raise ConfigurationError if one cannot be opened, or their times have different meanings.
 
-    def __exit__(self, *error: object) -> None:
-        self._opened.close()
+        Of a recording, which costs a process to open, only the first one is opened here; see :meth:`chunks`.
+        """
+        super().__init__(paths[0])
+        self._paths, self._open_file = tuple(paths), open_file
+        self._readers: list[Reader] = []  # Those that have been read, and the present one
+        self._first: Reader | None = open_file(paths[0])
+        first = self._first
+        self.place, self.is_table, self.sampling = f"its file's {first.place}", first.is_table, first.sampling
+        self._description, ignored = first.describe(), list(first.ignored)
+        try:
+            for path in paths[1:]:
+                if costs_a_process(path):
+                    continue
+                with open_file(path) as reader:
+                    self._check(reader)
+                    ignored += reader.ignored
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        self.ignored = tuple(dict.fromkeys(ignored))
+
+    def _check(self, reader: Reader) -> None:
+        if reader.sampling != self.sampling:
+            kinds = f"{_kind(reader.sampling)} times, but {self.path} has {_kind(self.sampling)} ones"
+            raise ConfigurationError(f"{reader.path}: {kinds}: replay them apart")
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._first is not None:
+            self._first.__exit__(kind, error, _)
 
     @property
     def progress(self) -> float:
         """Share of the files that was read, 0 to 1."""
-        return sum(reader.progress for _, reader in self._readers) / len(self._readers)
-
-    @property
-    def bad(self) -> int:
-        return sum(reader.bad for _, reader in self._readers)
-
-    @property
-    def lost(self) -> int:
-        return sum(reader.lost for _, reader in self._readers)
-
-    def summary_lines(self) -> list[str]:
-        return [f"{title}: {', '.join(reader.summary_lines())}" for title, reader in self._readers]
-
-    def warnings(self) -> list[str]:
-        return [f"{reader.path}: {line}" for _, reader in self._readers for line in reader.warnings()]
-
-
-class JoinedReader(ReaderGroup):
-    """Reads files one after the other, in the order given."""
-
-    def __init__(self, paths: Sequence[Path], open_file: Callable[[Path], Reader]) -> None:
-        """Open all files; raise ConfigurationError if one cannot be opened, or their times have different meanings."""
-        super().__init__(paths[0], ((path.name, partial(open_file, path)) for path in paths))
-        readers = [reader for _, reader in self._readers]
-        first = readers[0]
-        for reader in readers:
-            if reader.sampling != first.sampling:
-                self._opened.close()
-                kinds = f"{_kind(reader)} times, but {first.path} has {_kind(first)} ones"
-                raise ConfigurationError(f"{reader.path}: {kinds}: replay them apart")
-        self.is_table, self.sampling = first.is_table, first.sampling
-        self._finished = 0
+        return sum(reader.progress for reader in self._readers) / len(self._paths)
 
     @property
     def file(self) -> Path:
-        return self._readers[min(self._finished, len(self._readers) - 1)][1].path
+        return self._readers[-1].path if self._readers else self.path
+
+    @property
+    def bad(self) -> int:
+        return sum(reader.bad for reader in self._readers)
+
+    @property
+    def lost(self) -> int:
+        return sum(reader.lost for reader in self._readers)
 
     def chunks(self) -> Iterator[Rows]:
-        """See :meth:`Reader.chunks`; the first row of each file but the first is marked."""
+        """See :meth:`Reader.chunks`; the first row of each file but the first is marked.
+
+        A recording after the first one is opened only here, so its error ends the reading.
+        """
         bad_before = 0
-        for number, (_, reader) in enumerate(self._readers):
-            is_first = number > 0
-            for rows in reader.chunks():
-                marks: Mask = rows.begins.copy()
-                marks[0] |= is_first
-                is_first = False
-                yield Rows(rows.times, rows.columns, rows.lines, rows.bad + bad_before, marks)
-            bad_before += reader.bad
-            self._finished += 1
+        for number, path in enumerate(self._paths):
+            opened, self._first = self._first or self._open_file(path), None
+            with opened as reader:
+                self._check(reader)
+                self._readers.append(reader)
+                is_first = number > 0
+                for rows in reader.chunks():
+                    marks: Mask = rows.begins.copy()
+                    marks[0] |= is_first
+                    is_first = False
+                    yield Rows(rows.times, rows.columns, rows.lines, rows.bad + bad_before, marks)
+                bad_before += reader.bad
+
+    def summary_lines(self) -> list[str]:
+        lines = [f"{reader.path.name}: {', '.join(reader.summary_lines())}" for reader in self._readers]
+        return lines + [f"{path.name}: not read" for path in self._paths[len(lines) :]]
+
+    def warnings(self) -> list[str]:
+        return [f"{reader.path}: {line}" for reader in self._readers for line in reader.warnings()]
 
     def describe(self) -> list[str]:
-        return [*self._readers[0][1].describe(), f"from {len(self._readers)} files, each a recording of its own"]
+        return [*self._description, f"from {len(self._paths)} files, each a recording of its own"]
 
 
-def _kind(reader: Reader) -> str:
-    """Return the meaning of the times of a file."""
-    kinds = reader.sampling
+def costs_a_process(path: Path) -> bool:
+    """Whether ``path`` is a recording; raise ConfigurationError if it has only the name of one, or is missing."""
+    if suffix_of(path) != RECORDING:
+        return False
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+    if not head_of(path).startswith(RECORDING_HEAD):
+        raise ConfigurationError(f"{path}: is no recording of Rerun, which its name says")
+    return True
+
+
+def _kind(kinds: Sampling | Mapping[str, Sampling]) -> str:
+    """Return the meaning of the times of a file in words."""
     return kinds if isinstance(kinds, Sampling) else ", ".join(f"{name} {kind}" for name, kind in kinds.items())
 
 
@@ -442,17 +463,44 @@ class _Feed:
         return not len(self._clock)
 
 
-class MergedReader(ReaderGroup):
+class MergedReader(Reader):
     """Reads the files of all sources at the same time; their times must be those of one clock."""
 
     def __init__(self, path: Path, signals: Mapping[str, Sequence[str]], open_source: Callable[[str], Reader]) -> None:
         """Open the file of each source; ``signals`` has those of each; ``path`` stands for all files in messages."""
-        super().__init__(path, ((name, partial(open_source, name)) for name in signals))
+        super().__init__(path)
+        with ExitStack() as opened:
+            self._readers = [(name, opened.enter_context(open_source(name))) for name in signals]
+            self._opened = opened.pop_all()
+        self.place = f"its file's {self._readers[0][1].place}"
+        self.ignored = tuple(dict.fromkeys(name for _, reader in self._readers for name in reader.ignored))
         self._signals = [signal for names in signals.values() for signal in names]
         self.sampling = {
             signal: sampling_of(reader.sampling, signal) for name, reader in self._readers for signal in signals[name]
         }
         self._bad = 0
+
+    def __exit__(self, *error: object) -> None:
+        self._opened.close()
+
+    @property
+    def progress(self) -> float:
+        """Share of the files that was read, 0 to 1."""
+        return sum(reader.progress for _, reader in self._readers) / len(self._readers)
+
+    @property
+    def bad(self) -> int:
+        return sum(reader.bad for _, reader in self._readers)
+
+    @property
+    def lost(self) -> int:
+        return sum(reader.lost for _, reader in self._readers)
+
+    def summary_lines(self) -> list[str]:
+        return [f"{title}: {', '.join(reader.summary_lines())}" for title, reader in self._readers]
+
+    def warnings(self) -> list[str]:
+        return [f"{reader.path}: {line}" for _, reader in self._readers for line in reader.warnings()]
 
     def chunks(self) -> Iterator[Rows]:
         """The rows of all files by time; raise ConfigurationError also if one file ends before another begins."""

@@ -11,34 +11,30 @@ differences of the times in ns, then each signal. The bytes of equal weight of a
 because those of a slow signal repeat.
 """
 
+import json
 import struct
 import subprocess
 import sys
-import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rerun.chunk import RrdReader
-from rerun.error_utils import RerunWarning
 
 from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.replay import recording_child
 from otolith_drivers.replay.readers import Array, Integers, Reader, Rows
+from otolith_drivers.replay.recording_child import END, FAULT, OPENED, PART, SAMPLES_ENTITY, TIMES, TIMES_ENTITY, WINDOW
 from otolith_drivers.units import factor
 
 CHUNK = 50_000  # readings of all signals together; engineering choice, guarded by test_recorder.py
 MAX_NS = np.iinfo(np.int64).max
 
-# The layout of otolith.publishing.recorder.
-APPLICATION, TIMELINE = "otolith", "time"
-SAMPLES, TIMES = "/samples", "/times"
-WINDOW = "window"  # the column of SAMPLES
-TEXT = "TextDocument:text"
-READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdReader(sys.argv[1]).stream()]"
+APPLICATION = "otolith"  # as otolith.publishing.recorder names it
+READ_IN_CHILD = [sys.executable, "-P", recording_child.__file__]
 MAX_RECORDS = 1_000_000  # as many as a window of a machine file may have
 HEADER = struct.Struct("<I?")
 
@@ -95,72 +91,108 @@ def open_log(path: Path, setup: Setup, _: object = None) -> "RecordingReader":
     return RecordingReader(path, {signal.name: signal.unit for signal in setup.signals})
 
 
+class _Parts:
+    """The parts that a child process sends of a recording, which it reads once."""
+
+    def __init__(self, path: Path) -> None:
+        self.progress = 0.0  # Share of the file that was read, 0 to 1
+        # In a process group of its own: Ctrl-C would end it, which does not mean that the file is damaged.
+        self._child = subprocess.Popen(  # noqa: S603 - our own interpreter
+            [*READ_IN_CHILD, str(path)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, process_group=0
+        )
+
+    def __iter__(self) -> Iterator[tuple[bytes, bytes]]:
+        """Yield letter and content of each part; the last one is FAULT, without content if the child has aborted."""
+        pipe = self._child.stdout
+        assert pipe is not None  # noqa: S101 - for the type checker
+        while len(head := pipe.read(PART.size)) == PART.size:
+            letter, size, self.progress = PART.unpack(head)
+            if len(content := pipe.read(size)) < size:
+                break
+            yield letter, content
+            if letter in (END, FAULT):
+                return
+        yield FAULT, b""
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.kill()
+        self._child.communicate()
+
+
 class RecordingReader(Reader):
-    """A recording, read by Rerun; the library keeps no file open."""
+    """A recording, which a child process reads while it is replayed."""
 
     place = "record"
     bad = 0
-    progress = 0.0
 
     def __init__(self, path: Path, units: dict[str, str]) -> None:
-        """Read the file once for its signals; ``units`` has the unit of each wanted signal.
+        """Read the file as far as its first window; ``units`` has the unit of each wanted signal.
 
         Raises:
             ConfigurationError: the file is missing, damaged, of another program, or lacks a wanted signal.
         """
         super().__init__(path)
-        self._records = self._windows = self._windows_read = self._windows_bad = 0
-        if not path.is_file():
-            raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
-        self._check_in_a_child()
-        with warnings.catch_warnings(record=True) as raised:
-            warnings.simplefilter("always", RerunWarning)
-            self._file = self._guarded(RrdReader, path)
-        self._closed = not raised
+        self._records = self._windows_bad = 0
         self._delays: dict[str, int] = {}  # ns; subtracted from the recorded times, so that the readings came later
         self._units = units
-        self._written: dict[str, str] = {}
-        self._scan()
-        self._places = {name: place for place, name in enumerate(self._written)}
-        self._scales = {name: self._scale(name, unit) for name, unit in units.items()}
+        self._written: dict[str, str] | None = None  # Unit of each recorded signal; None until the file tells them
+        self._closed, self._ended = True, False
+        if not path.is_file():
+            raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+        self._child = _Parts(path)
+        self._parts = iter(self._child)
+        try:
+            self._waiting = self._read_first_windows()
+            written: dict[str, str] = self._written or {}
+            self._places = {name: place for place, name in enumerate(written)}
+            self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
+        except BaseException:
+            self._child.close()
+            raise
 
-    def _check_in_a_child(self) -> None:
-        """Raise ConfigurationError if the library's native code aborts on the file: a child process reads it first."""
-        command = [sys.executable, "-c", READ_ALL, str(self.path)]
-        # In a process group of its own: Ctrl-C would end it, which does not mean that the file is damaged.
-        child = subprocess.run(command, capture_output=True, check=False, process_group=0)  # noqa: S603 - our own interpreter
-        if child.returncode < 0:
-            raise ConfigurationError(f"{self.path}: damaged, or no recording (its reader aborts); {self._repair}")
+    def __exit__(self, *error: object) -> None:
+        self._child.close()
+
+    @property
+    def progress(self) -> float:
+        """Share of the file that was read, 0 to 1."""
+        return 1.0 if self._ended else self._child.progress
+
+    def _read_first_windows(self) -> list[bytes]:
+        """Read what the records mean, and return the windows up to there, one at least unless the file has none."""
+        windows: list[bytes] = []
+        while not self._ended and (self._written is None or not windows):
+            windows += self._next_window()
+        return windows
+
+    def _next_window(self) -> list[bytes]:
+        """Return the next window, or nothing if the next part is none; raise ConfigurationError for a damaged file."""
+        letter, content = next(self._parts)
+        if letter == WINDOW:
+            return [content]
+        if letter == OPENED:
+            self._note_opened(json.loads(content))
+        elif letter == TIMES:
+            self._note_times(content.decode())
+        elif letter == END:
+            self._ended = True
+        else:
+            cause = content.decode(errors="replace") or "its reader aborts"
+            raise ConfigurationError(f"{self.path}: damaged, or no recording ({cause}); {self._repair}")
+        return []
 
     @property
     def _repair(self) -> str:
         return f"'rerun rrd optimize --continue-on-error {self.path} -o whole.rrd' saves what is whole"
 
-    def _guarded(self, step: Any, *arguments: Any) -> Any:
-        """The result of a call of Rerun, which raises several types for a damaged file."""
-        try:
-            return step(*arguments)
-        except (RuntimeError, ValueError, KeyError, OSError) as error:
-            cause = str(error).rpartition(": ")[2] or str(error)
-            raise ConfigurationError(f"{self.path}: damaged, or no recording ({cause}); {self._repair}") from error
-
-    def _stream(self) -> Iterator[Any]:
-        chunks = iter(self._guarded(self._file.stream))
-        while (chunk := self._guarded(next, chunks, None)) is not None:
-            yield chunk
-
-    def _scan(self) -> None:
-        """Read what the records mean, and count the windows."""
-        recordings = self._guarded(self._file.recordings)
-        if len(recordings) != 1:
-            raise ConfigurationError(f"{self.path}: {len(recordings)} recordings in it: one of Otolith is needed")
-        if (application := recordings[0].application_id) != APPLICATION:
-            raise ConfigurationError(f"{self.path}: of application {application!r}: one of Otolith is needed")
-        for chunk in self._stream():
-            if str(chunk.entity_path) == TIMES:
-                self._note_times(self._guarded(chunk.to_record_batch).column(TEXT).to_pylist()[0][0])
-            elif str(chunk.entity_path) == SAMPLES:
-                self._windows += chunk.num_rows
+    def _note_opened(self, opened: dict[str, Any]) -> None:
+        applications = opened["applications"]
+        if len(applications) != 1:
+            raise ConfigurationError(f"{self.path}: {len(applications)} recordings in it: one of Otolith is needed")
+        if applications[0] != APPLICATION:
+            raise ConfigurationError(f"{self.path}: of application {applications[0]!r}: one of Otolith is needed")
+        self._closed = opened["is_closed"]
 
     def _note_times(self, text: str) -> None:
         """Note what the records mean."""
@@ -169,18 +201,20 @@ class RecordingReader(Reader):
         except ValueError as error:
             known = ", ".join(Sampling)
             remedy = f"it needs sampling ({known}), delays and signals: was it written by another version of Otolith?"
-            raise ConfigurationError(f"{self.path}: {TIMES} does not state what the times mean: {remedy}") from error
+            raise ConfigurationError(
+                f"{self.path}: {TIMES_ENTITY} does not state what the times mean: {remedy}"
+            ) from error
         self.sampling, self._written = written.sampling, written.signals
         self._delays = {name: round(1e9 * delay) for name, delay in written.delays.items()}
 
-    def _scale(self, name: str, unit: str) -> tuple[float, float]:
-        """Scale and offset from the recorded unit of a signal to ``unit``."""
-        if name not in self._written or not self._windows:
-            others = [other for other in self._written if other not in self._units]
-            known = nearest(name, others) if others else f"it has {', '.join(sorted(self._written)) or 'none'}"
+    def _scale(self, name: str, unit: str, written: Mapping[str, str]) -> tuple[float, float]:
+        """Scale and offset from the recorded unit of a signal, in ``written``, to ``unit``."""
+        if name not in written or not self._waiting:
+            others = [other for other in written if other not in self._units]
+            known = nearest(name, others) if others else f"it has {', '.join(sorted(written)) or 'none'}"
             raise ConfigurationError(f"{self.path}: no signal {name!r} ({unit}) was recorded: {known}")
         try:
-            return factor(self._written[name], unit)
+            return factor(written[name], unit)
         except ValueError as error:
             raise ConfigurationError(f"{self.path}: signal {name!r}: {error}") from error
 
@@ -201,16 +235,12 @@ class RecordingReader(Reader):
 
     def _read_windows(self) -> Iterator[tuple[Integers, Array]]:
         """Yield times in ns and values (signals, records) of each window; a bad window has no readings."""
-        for chunk in self._stream():
-            if str(chunk.entity_path) != SAMPLES:
-                continue
-            batch = self._guarded(chunk.to_record_batch)
-            for data in self._guarded(batch.column, WINDOW).to_pylist():
-                self._windows_read += 1
-                self.progress = self._windows_read / self._windows
+        windows = self._waiting
+        while windows or not self._ended:
+            for data in windows:
                 try:
-                    good, times, values = unpacked(bytes(data[0]), len(self._written))
-                except (ValueError, TypeError, IndexError):
+                    good, times, values = unpacked(data, len(self._places))
+                except ValueError:
                     self.bad += 1
                     continue
                 if not good:
@@ -218,6 +248,7 @@ class RecordingReader(Reader):
                     values[:] = np.nan
                 if len(times):
                     yield times, values
+            windows = [] if self._ended else self._next_window()
 
     def _rows(self, buffers: dict[str, "_SignalBuffer"], until: int) -> Iterator[Rows]:
         """The rows up to ``until`` (ns), one for each time at which any signal has a reading."""
@@ -236,7 +267,7 @@ class RecordingReader(Reader):
         yield Rows(grid / 1e9, columns, numbers, np.full(len(grid), self.bad, dtype=np.int64))
 
     def describe(self) -> list[str]:
-        return [f"{name} [{unit}] from {SAMPLES}" for name, unit in self._units.items()]
+        return [f"{name} [{unit}] from {SAMPLES_ENTITY}" for name, unit in self._units.items()]
 
     def summary_lines(self) -> list[str]:
         return [f"{self._records} records read", f"{self.bad} bad"]

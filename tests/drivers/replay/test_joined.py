@@ -7,9 +7,11 @@ import pytest
 
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.samples import SignalPlan
+from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import JoinedReader, Reader
 from otolith_drivers.replay.tables import TableReader
+from tests.messages import raises_saying
 
 PERIOD, RECORDS = 0.01, 50
 
@@ -47,3 +49,49 @@ def test_no_window_spans_two_files(tmp_path: Path, later: float) -> None:
 def test_a_missing_file_is_named_before_any_is_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"absent\.csv"):
         JoinedReader([write(tmp_path, "a.csv", 0.0, 10, 0.0), tmp_path / "absent.csv"], opened)
+
+
+def test_of_two_hundred_files_one_is_open_at_a_time(tmp_path: Path) -> None:
+    files = [write(tmp_path, f"{number}.csv", 10.0 * number, 5, 0.0) for number in range(200)]
+    before, most, rows = descriptors(), 0, 0
+    with JoinedReader(files, opened) as joined:
+        most = descriptors() - before
+        for part in joined.chunks():
+            most, rows = max(most, descriptors() - before), rows + len(part.times)
+    assert rows == 1000
+    assert most <= 2
+    assert descriptors() == before
+
+
+def descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_a_file_with_times_of_another_meaning_is_named_before_any_is_read(tmp_path: Path) -> None:
+    def opened_as(path: Path) -> Reader:
+        reader = opened(path)
+        reader.sampling = Sampling.POLLED if path.name == "b.csv" else Sampling.TRUE
+        return reader
+
+    files = [write(tmp_path, name, 0.0, 10, 0.0) for name in ("a.csv", "b.csv")]
+    before = descriptors()
+    with raises_saying(ConfigurationError, "b.csv", "polled", "a.csv", "true"):
+        JoinedReader(files, opened_as)
+    assert descriptors() == before
+
+
+def test_a_file_that_only_has_the_name_of_a_recording_is_named_before_any_is_read(tmp_path: Path) -> None:
+    first, other = write(tmp_path, "a.csv", 0.0, 10, 0.0), tmp_path / "b.rrd"
+    with raises_saying(ConfigurationError, "b.rrd", "No such file"):
+        JoinedReader([first, other], opened)
+    other.write_text("t,x", encoding="utf-8")
+    with raises_saying(ConfigurationError, "b.rrd", "no recording"):
+        JoinedReader([first, other], opened)
+
+
+def test_a_file_that_was_not_reached_is_named(tmp_path: Path) -> None:
+    files = [write(tmp_path, name, 0.0, 10, 0.0) for name in ("a.csv", "b.csv")]
+    with JoinedReader(files, opened) as joined:
+        next(joined.chunks())
+        assert joined.summary_lines()[1] == "b.csv: not read"
+        assert joined.file == files[0]

@@ -86,12 +86,14 @@ def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
 
 
 def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
-    from otolith.estimation.problem import equation
-    from otolith.health.text import half_width_text
+    from otolith.estimation.problem import equation, site_of
+    from otolith.health.text import interval_text
     from otolith_drivers.units import equation_text
 
-    text = equation_text(equation(machine.twin, record.adopted.component, record.values))
-    return f"{text} (amplitude ± {half_width_text(record.deviations[0])})"
+    component = record.adopted.component
+    text = equation_text(equation(machine.twin, component, record.values))
+    unit = site_of(machine.twin, component.site).unit
+    return f"{text} (amplitude {interval_text(record.values[0], record.deviations[0], unit)})"
 
 
 @components.command()
@@ -341,9 +343,9 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     """Store and print the baselines of ``histories``; raise ConfigurationError if there are too few estimates."""
     from otolith.health.limits import Level
     from otolith.health.prognosis import MIN_POINTS, baselines
-    from otolith.health.text import interval_text, number_text
+    from otolith.health.text import interval_text
     from otolith_drivers.errors import ConfigurationError
-    from otolith_drivers.units import unit_text
+    from otolith_drivers.units import quantity_text
 
     limited = {name: row for name, row in machine.plan.parameters.items() if row.limits}
     kept = {name: item for name, item in baselines(histories).items() if name in limited}
@@ -357,7 +359,7 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
         echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}", err=True)
         level, limit = limited[name].level(item.value, item.sd, Level.OK)
         if limit is not None:
-            beyond = f"{level} {limit.side} {number_text(limit.value)} {unit_text(limited[name].unit)}"
+            beyond = f"{level} {limit.side} {quantity_text(limit.value, limited[name].unit)}"
             echo(f"{name}: beyond its limit {beyond}; if the machine is not healthy, undo it: --clear", err=True)
     for name in limited.keys() - kept.keys():
         echo(f"{name} has fewer than {MIN_POINTS} estimates: its limits stay as they were", err=True)

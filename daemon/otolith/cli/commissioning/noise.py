@@ -181,15 +181,16 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
     """What all windows show and the twin lacks, as comments."""
-    from otolith.estimation.problem import equation
-    from otolith.health.text import half_width_text
+    from otolith.estimation.problem import equation, site_of
+    from otolith.health.text import interval_text
 
     for item in structure:
         component = item.component
         values = (component.amplitude, component.inner, component.phase)
         text = equation(machine.twin, component, values[: 2 if item.is_restarted else 3])
         again = f", again every {_repeat(machine, item)}" if component.periodic else ""
-        yield f"# structure: {component.key}: {text} (amplitude ± {half_width_text(item.sd)}){again}"
+        amplitude = interval_text(component.amplitude, item.sd, site_of(machine.twin, component.site).unit)
+        yield f"# structure: {component.key}: {text} (amplitude {amplitude}){again}"
         if item.is_at_bound:
             yield f"# its {_inner_meaning(item)} lies at a bound of the search, so its shape is not known: not offered"
     if structure:

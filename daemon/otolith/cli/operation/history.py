@@ -300,8 +300,7 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
 def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
-    from otolith.health.text import number_text, number_texts
-    from otolith_drivers.units import unit_text
+    from otolith_drivers.units import scale_of
 
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
@@ -320,8 +319,9 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
         reach = None if end.low is None or end.high is None else 0.5 * (end.high - end.low)
         change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
-        limits = (number_text(low), number_text(high)) if has_range else ()
-        table.add_row(name, *number_texts(end.last, reach), unit_text(unit), change, *limits, curve)
+        scale = scale_of(max(abs(end.last), reach or 0.0), unit)
+        limits = (scale.number(low), scale.number(high)) if has_range else ()
+        table.add_row(name, *scale.numbers(end.last, reach), scale.unit, change, *limits, curve)
     return table
 
 
