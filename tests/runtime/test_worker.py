@@ -163,7 +163,7 @@ def test_windows_missed_during_compilation_are_logged_once(
 class SlowWorker:
     """A process that sends steps when the test does, and never a result."""
 
-    alive, starts = True, 1
+    alive, starts, processor_time = True, 1, 0.0
 
     def __init__(self) -> None:
         self.sent: list[object] = []
@@ -220,6 +220,24 @@ def test_a_worker_that_hangs_while_it_compiles_is_killed(batch: list[Window]) ->
     assert worker.killed == 0
     supervisor.poll(STEP + 2 * LENGTH + 1.1)
     assert worker.killed == 1
+
+
+@pytest.mark.parametrize(("share", "is_killed"), [(1.0, True), (0.05, False), (0.0, True)])
+def test_a_worker_on_a_busy_computer_is_killed_by_the_processor_time_that_it_takes(
+    share: float, is_killed: bool, batch: list[Window]
+) -> None:
+    """Three minutes with a ``share`` of a processor, of which the worker gets its turn every 0.5 s."""
+    supervisor, worker = slow(batch)
+    worker.sent = [Ready()]
+    supervisor.poll(0.0)
+    for tick in range(1, 1801):
+        worker.processor_time = 0.5 * share * (tick // 5)
+        supervisor.poll(0.1 * tick)
+        if worker.killed:
+            break
+    assert bool(worker.killed) is is_killed
+    if is_killed:
+        assert WINDOW_TIMEOUT + 2 * LENGTH < 0.1 * tick < WINDOW_TIMEOUT + 2 * LENGTH + 1.5
 
 
 def test_kernels_that_are_loaded_are_no_progress(batch: list[Window]) -> None:

@@ -124,7 +124,7 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
             except BlockingIOError:
                 return False
 
-        service._progress_at = 1000.0
+        service._stall.begin(1000.0, 0.0)
         service._feed_watchdog(1002.0)
         assert fed()
         patience = STALL_TIMEOUT + 3 * 2.0 + COMPILE_TIMEOUT

@@ -23,6 +23,7 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 from otolith.health.schema import EventDocument
+from otolith.runtime.effort import processor_time
 from otolith_drivers.grammars.json_lines import json_text
 
 log = logging.getLogger(__name__)
@@ -159,6 +160,12 @@ class ChildProcess:
     def age(self) -> float:
         """Seconds since the process was started."""
         return time.monotonic() - self._started_at
+
+    @property
+    def processor_time(self) -> float:
+        """Processor time that the process has taken, s; 0 if it does not run."""
+        pid = None if self._process is None else self._process.pid
+        return 0.0 if pid is None else processor_time(pid)
 
     @property
     def waitables(self) -> list[Any]:

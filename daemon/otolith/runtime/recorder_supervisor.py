@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from otolith.health.schema import Report
+from otolith.runtime.effort import Effort
 from otolith.runtime.process import ChildProcess
 from otolith.storage.recording_files import DAY, GIGABYTE, MEGABYTE, RESUME_FACTOR, RecordingBudget, RecordingFolder
 from otolith_drivers.errors import OtolithError
@@ -26,7 +27,7 @@ log = logging.getLogger(__name__)
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
-RECORDER_TIMEOUT = 60.0  # s without an answer, while windows wait, after which the recorder hangs
+RECORDER_TIMEOUT = 60.0  # s of effort without an answer, while windows wait, after which the recorder hangs
 FOLDER_TIMEOUT = 60.0  # s without an answer of the disk after which it hangs
 MIN_DEATHS = 4  # of the recorder in a row, from which it is out of order and not restarted by chance
 MIN_FILES = 8  # files that the budget has room for at least
@@ -72,7 +73,7 @@ class RecorderSupervisor:
         self._early: list[Report] = []  # Windows since the start of the preparation of the first file
         self._unanswered = self._unwritten = 0
         self._planned_starts = 1
-        self._progress_at = 0.0
+        self._effort = Effort()  # since the last answer
         self._problem = ""
         self._first: tuple[object, ...] | None = None  # arguments of the process, until it is spawned
         self.dropped = 0  # Windows that were not recorded
@@ -140,9 +141,11 @@ class RecorderSupervisor:
         if self._take_preparation(now) or self._first is not None:
             return
         for waiting in self._process.replies():
-            self._unanswered, self._unwritten, self._progress_at = max(0, self._unanswered - 1), waiting, now
-        if self._process.alive and self._unanswered and now - self._progress_at > RECORDER_TIMEOUT:
-            log.warning("the recorder has not answered for %g s and is killed", now - self._progress_at)
+            self._unanswered, self._unwritten = max(0, self._unanswered - 1), waiting
+            self._effort.begin(now, self._process.processor_time)
+        seconds = self._effort.seconds(now, self._process.processor_time)
+        if self._process.alive and self._unanswered and seconds > RECORDER_TIMEOUT:
+            log.warning("the recorder has not answered in %g s of processor time and waiting, and is killed", seconds)
             self._process.kill()
         if self._process.alive:
             if self._process.age > RECORDER_HEALTHY_AGE:
@@ -162,7 +165,7 @@ class RecorderSupervisor:
             self.dropped += 1
             return
         if not self._unanswered:
-            self._progress_at = now
+            self._effort.begin(now, self._process.processor_time)
         self._unanswered += 1
 
     def _take_preparation(self, now: float) -> bool:
@@ -183,7 +186,8 @@ class RecorderSupervisor:
 
     def _launch(self, path: Path, folder: RecordingFolder | None, now: float) -> None:
         arguments = (path, self._machine.recorded(self._machine.driver.sampling), folder)
-        self._progress_at, self._problem = now, ""
+        self._effort.begin(now, self._process.processor_time)
+        self._problem = ""
         log.info("recording to %s", path)
         if self._process.starts or self._early:
             self._process.start(*arguments)

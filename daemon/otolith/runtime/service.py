@@ -37,6 +37,7 @@ from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import protect_files
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
+from otolith.runtime.effort import Effort
 from otolith.runtime.process import SIGNALS, EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
@@ -57,7 +58,7 @@ MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process a
 MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
-STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
+STALL_TIMEOUT = 30.0  # s of effort without a finished window, and three window lengths; then no watchdog is fed
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
@@ -188,7 +189,8 @@ class Service:
         self._stop_signal: int | None = None
         self._is_reload_due = False
         self._windows = self._windows_bad = self._progress = 0
-        self._started_at = self._progress_at = self._fed_at = 0.0
+        self._started_at = self._fed_at = 0.0
+        self._stall = Effort()  # of the worker since its last progress
         self._summarised_at = -math.inf
 
     def run(self) -> int:
@@ -242,7 +244,8 @@ class Service:
         self._supervisor.start()
         if self._recorder.is_enabled:
             self._recorder.start(time.monotonic())
-        self._started_at = self._progress_at = time.monotonic()
+        self._started_at = time.monotonic()
+        self._stall.begin(self._started_at, self._supervisor.worker.processor_time)
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
         log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, self._publisher.endpoints)
 
@@ -460,10 +463,12 @@ class Service:
 
     def _feed_watchdog(self, now: float) -> None:
         """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
+        spent = self._supervisor.worker.processor_time
         if self._supervisor.progress != self._progress:
-            self._progress, self._progress_at = self._supervisor.progress, now
+            self._progress = self._supervisor.progress
+            self._stall.begin(now, spent)
         compiling = COMPILE_TIMEOUT if self._supervisor.is_compiling else 0.0
-        stalled = now - self._progress_at > STALL_TIMEOUT + 3 * self._windower.length + compiling
+        stalled = self._stall.seconds(now, spent) > STALL_TIMEOUT + 3 * self._windower.length + compiling
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now
             self._notifier.send("WATCHDOG=1")

@@ -22,6 +22,7 @@ from otolith import kernel_cache
 from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
+from otolith.runtime.effort import Effort
 from otolith.runtime.process import ChildProcess
 
 log = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ log = logging.getLogger(__name__)
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 WARM_UP_RECORDS = 40  # of the random window that makes a new worker compile every kernel
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
-WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
+WINDOW_TIMEOUT = 20.0  # s of effort for a window, in addition to twice its length
 COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
 NOT_READY = "the worker is starting; if the twin is new on this computer, it compiles kernels, which takes minutes"
 
@@ -113,10 +114,10 @@ class Supervisor:
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._timeout = WINDOW_TIMEOUT + 2 * length
         self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
+        self._effort = Effort()  # of the current window, or of a kernel
         self._waiting: deque[Window] = deque()
         self._current: Window | None = None
         self._retried: int | None = None
-        self._deadline = 0.0
         self._last_reason = ""
 
     @property
@@ -161,13 +162,17 @@ class Supervisor:
             self._requeue()
             if self.worker.may_restart(now):
                 self.start()
-        elif self._current is not None and now > self._deadline:
-            seconds = self._allowed_seconds
-            log.warning("the worker has not finished window %d in %.0f s and is killed", self._current.index, seconds)
+        elif self._current is not None and self._hangs(now):
+            what = f"the worker has not finished window {self._current.index}"
+            log.warning("%s in %.0f s of processor time and waiting, and is killed", what, self._allowed_seconds)
             self._requeue()
             self.worker.kill()
         self._dispatch(now)
         return reports
+
+    def _hangs(self, now: float) -> bool:
+        """Whether the worker has computed, or waited for something else than its turn, for longer than allowed."""
+        return self._effort.seconds(now, self.worker.processor_time) > self._allowed_seconds
 
     def _note(self, step: kernel_cache.CompileStep | Ready, now: float) -> None:
         """Allow time from this step on. Loading a kernel is no progress: a worker that always dies loads some, too."""
@@ -177,7 +182,7 @@ class Supervisor:
             self.progress += 1
             log.info("compiled kernel %s", step.kernel)
         self.is_compiling = not self._is_ready or not (isinstance(step, Ready) or step.is_end)
-        self._deadline = now + self._allowed_seconds
+        self._effort.begin(now, self.worker.processor_time)
 
     def _take(self, result: WorkerResult) -> tuple[Report, float] | None:
         window = self._current
@@ -211,7 +216,7 @@ class Supervisor:
         self.state, self._changes = self._next_state(), []
         self._current = self._waiting.popleft()
         self.worker.offer((self.state, self._current))
-        self._deadline = now + self._allowed_seconds
+        self._effort.begin(now, self.worker.processor_time)
 
     def _next_state(self) -> AdaptationState:
         """Return the state with all pending changes."""

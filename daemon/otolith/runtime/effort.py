@@ -1,0 +1,44 @@
+"""When a process hangs: by the processor time that it takes, whatever else this computer does.
+
+A process on a busy computer gets little processor time, and its work takes long. One that computes for ever takes
+processor time; one that waits for ever takes none.
+"""
+
+from contextlib import suppress
+from os import sysconf
+from pathlib import Path
+
+# Threshold: docs/reference/thresholds-runtime.md has its origin.
+MAX_TURN = 1.0  # s without processor time, beyond which a process waits for something else than its turn
+
+
+def processor_time(pid: int) -> float:
+    """Return the processor time that a process of this computer has taken, s; 0 if there is none."""
+    with suppress(OSError, ValueError, IndexError):
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / sysconf("SC_CLK_TCK")
+    return 0.0
+
+
+class Effort:
+    """The time that counts since the begin of some work: that of the processor, and that of waiting without any.
+
+    Times of the clock are monotonic, s. Processor times are those of the present process, of several after another.
+    """
+
+    def __init__(self) -> None:
+        self._counted = self._spent = self._advanced_at = self._seen_at = 0.0
+
+    def begin(self, now: float, spent: float) -> None:
+        """Count from ``now`` on, when the process has taken the processor time ``spent`` (s)."""
+        self._counted, self._spent, self._advanced_at, self._seen_at = 0.0, spent, now, now
+
+    def seconds(self, now: float, spent: float) -> float:
+        """Return the time that counts until ``now``, s."""
+        if spent != self._spent:
+            waited = self._seen_at - self._advanced_at
+            self._counted += (spent - self._spent if spent > self._spent else spent) + waited * (waited > MAX_TURN)
+            self._spent, self._advanced_at = spent, now
+        self._seen_at = now
+        waited = now - self._advanced_at
+        return self._counted + waited * (waited > MAX_TURN)
