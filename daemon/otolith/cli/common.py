@@ -23,6 +23,7 @@ SERVICES = Path("/var/lib/otolith")  # state directories of the instances of sys
 INSTALLED = Path("/etc/otolith")  # their machine files
 DEMOS = "demo"  # folder in the state directory with one for each demo, whose names sort by time
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
+STEP_TIMEOUT, BREAK_INTERVAL = 2.0, 0.5  # s until a step is broken off after a signal; until that is tried again
 FILE = click.Path(path_type=Path, dir_okay=False)
 MACHINE_FILE = click.argument("file", type=FILE)
 DATA_FILE = click.argument("data", type=FILE)
@@ -53,11 +54,16 @@ def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path |
     return path
 
 
+class _OverdueError(BaseException):
+    """The step that a signal asked to end has not ended; like KeyboardInterrupt, no other exception."""
+
+
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 
     def __init__(self) -> None:
         self._number: int | None = None
+        self._is_ending = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP, and that stays so
                 signal.signal(number, self._receive)
@@ -70,8 +76,33 @@ class StopSignal:
         """Exit code: 0 without a signal and for the signal ``clean``, else 128 plus the number of the signal."""
         return 0 if self._number is None or self._number == clean else 128 + self._number
 
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """In this block, a step that goes on ``STEP_TIMEOUT`` after a signal is broken off, and the block ends."""
+        signal.signal(signal.SIGALRM, self._break_off)
+        self._is_ending = True
+        try:
+            if self._number is not None:
+                self._give_time()
+            yield
+        except _OverdueError:
+            pass
+        finally:
+            self._is_ending = False
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def _give_time(self) -> None:
+        # Again and again: some libraries drop an exception that is raised in a call back from their native code.
+        signal.setitimer(signal.ITIMER_REAL, STEP_TIMEOUT, BREAK_INTERVAL)
+
     def _receive(self, number: int, _: FrameType | None) -> None:
+        if self._is_ending and self._number is None:
+            self._give_time()
         self._number = number
+
+    def _break_off(self, _: int, __: FrameType | None) -> None:
+        if self._is_ending:
+            raise _OverdueError
 
 
 def log_to_stderr(*, verbose: bool) -> None:

@@ -207,7 +207,7 @@ def replay(
 
     stop = StopSignal()
     options = {"as_json": as_json, "real_time": real_time, "timing": timing}
-    replay(file, data, recording, stopped=stop.received, page=page, folder=folder, **options)
+    replay(file, data, recording, stopped=stop.received, page=page, folder=folder, ending=stop.ending, **options)
     return stop.code()
 
 

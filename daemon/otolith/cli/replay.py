@@ -3,7 +3,7 @@
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -116,11 +116,13 @@ def replay(
     timing: bool = False,
     page: Path | None = None,
     folder: Path | None = None,
+    ending: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
     Each file of ``data`` is a recording of its own. With ``timing`` reports have computing times, which differ from run
-    to run. The history of the reports is kept in ``folder``, and drawn as the new HTML file ``page``.
+    to run. The history of the reports is kept in ``folder``, and drawn as the new HTML file ``page``. ``ending`` breaks
+    off, in its block, what takes too long after a signal.
 
     Raises:
         OtolithError: a file that cannot be used, or that cannot be written.
@@ -132,7 +134,8 @@ def replay(
         if recorded.ignored:
             echo(f"{recorded.path}: columns not used: {', '.join(recorded.ignored)}", err=True)
         if not as_json:
-            _echo_preview(machine, data[0], stopped)
+            with ending():
+                _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
         run.state = _with_decisions(machine, run.state)
@@ -141,7 +144,13 @@ def replay(
             _history(machine, run, data, page, folder) as keep,
             progress_line("reading", enabled=not as_json) as show,
         ):
-            for report in run.reports():
+            reports = run.reports()
+            while not stopped():
+                report = None
+                with ending():  # a window may take long
+                    report = next(reports, None)
+                if report is None:
+                    break
                 summary.add(report.document)
                 record(report)
                 keep(report.document)
