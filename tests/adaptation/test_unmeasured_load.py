@@ -17,6 +17,7 @@ from benchmarks.changes.plants import HEALTHY, Plant, Values, generator, simulat
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.commissioning.identification import identify_noise
 from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import SwarmSearch, estimate
@@ -225,3 +226,11 @@ def test_a_load_that_changes_in_steps_is_no_event() -> None:
 def test_a_load_that_changes_slowly_is_no_event() -> None:
     case = next(case for case in CASES if case.name == "dc_motor, slow")
     assert not any(long_run(case, None, 100))
+
+
+@pytest.mark.full
+def test_the_rate_of_a_slow_load_is_identified() -> None:
+    case = next(case for case in CASES if case.name == "dc_motor, slow")
+    windows = [replace(window, index=index, start=2.0 * index) for index, window in enumerate(windows_of(case, 20))]
+    levels = {level.name: level.value for level in identify_noise(case.problem, windows).states}
+    assert levels["T_load"] == pytest.approx(0.4 * SLOW_CHANGE, rel=0.1)  # N·m: the range is 0.4 wide

@@ -34,6 +34,17 @@ def test_a_parameter_without_limits_is_named(tmp_path: Path) -> None:
     assert any(line.startswith("limits of R_a: ") for line in lines)
 
 
+def test_the_limits_that_are_proposed_are_accepted(tmp_path: Path) -> None:
+    """Also for a parameter whose nominal value is zero, of which there are no percentages."""
+    path = tmp_path / "machine.toml"
+    text = '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n[signals]\nT_load = { unknown = "constant" }\n'
+    path.write_text(text, encoding="utf-8")
+    (line,) = (line for line in describe(load_machine(path, for_replay=True)) if line.startswith("limits of T_load"))
+    proposed = line.partition("write ")[2].removesuffix(" under [parameters]")
+    path.write_text(f"{text}[parameters]\n{proposed}\n", encoding="utf-8")
+    assert len(load_machine(path, for_replay=True).plan.parameters["T_load"].limits) == 2
+
+
 def test_silent_machine_and_missing_signal_get_their_own_remark(tmp_path: Path) -> None:
     silent = checked(OwnMachine(tmp_path / "tcp", "modbus-tcp").machine, complete=False)
     assert silent["V_a"].endswith(": is the machine on?")

@@ -139,6 +139,24 @@ def test_the_rules_of_a_machine_file_are_kept(tmp_path: Path) -> None:
     assert (again, diagnose(again.rules, low)["condition_id"]) == (plan, "cable")
 
 
+def test_a_bundle_knows_which_inputs_have_no_sensor(batch: list[Window], folder: Path, tmp_path: Path) -> None:
+    text = FILE.path.read_text(encoding="utf-8").replace('{ signal = "LoadTorque" }', '{ unknown = "constant" }')
+    path = tmp_path / "machine.toml"
+    path.write_text(text.replace('T_load = "0.2 mN*m"', ""), encoding="utf-8")
+    machine = load_machine(path, with_driver=False)
+    kept = EvidenceWriter(machine)
+    kept.folder, before = folder, initial_state("dc-motor", "demo", machine.problem, machine.plan)
+    values = batch[0].values[:, [batch[0].signals.index(name) for name in machine.twin.signals]]
+    window = Window.whole(0, START, PERIOD, machine.twin.signals, values)
+    after, report = adapt(before, window)
+    kept.add(before, window, _raised(report), after)
+    kept.write()
+    (bundle,) = map(read_bundle, folder.glob("*.zip"))
+    assert bundle.state.posterior.problem.twin == machine.twin
+    again = adapt(bundle.state, bundle.windows[0].window)[1]
+    assert again.document.parameters == report.document.parameters
+
+
 def test_the_bits_and_the_order_of_numbers_are_kept() -> None:
     values = np.asfortranarray([[0.1, -0.0, np.nan], [np.inf, -np.inf, 5e-324]])
     window = Window.whole(0, -0.0, PERIOD, ("a", "b", "c"), values)
@@ -360,6 +378,12 @@ FORGED = {
     "another version": _set("version", value=99),
     "no version": lambda document: document.pop("version"),
     "an unknown key": _set("unknown", value=1),
+    "an unmeasured input that the twin has not": _set(
+        "unmeasured", value=[{"name": "no", "assumption": "constant", "expression": ""}]
+    ),
+    "an unmeasured input without an expression": _set(
+        "unmeasured", value=[{"name": "T_load", "assumption": "proportional", "expression": ""}]
+    ),
     "no windows": _set("windows", value=[]),
     "no state": _set("state", value=None),
     "a state of another type": _set(*FIRST, value=[1, 2]),

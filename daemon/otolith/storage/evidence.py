@@ -44,6 +44,7 @@ from otolith.storage.recording_files import STAMP
 from otolith.twin.components import augmented_model
 from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
+from otolith.twin.unmeasured import UnmeasuredInput, without_sensor
 from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
@@ -52,7 +53,7 @@ from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
 
-VERSION = 4  # of the bundles: raised when a state has other fields
+VERSION = 5  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
@@ -188,6 +189,7 @@ class Bundle:
 
     version: int
     versions: Mapping[str, str]
+    unmeasured: tuple[UnmeasuredInput, ...]  # Inputs without a sensor, by which the twin was rewritten
     events: tuple[EventDocument, ...]
     state: AdaptationState  # The state before the first window
     windows: tuple[EvidenceWindow, ...]
@@ -238,6 +240,8 @@ def _read_bundle(path: Path) -> Bundle:
         twin = read_twin(SourceFile(Path(TWIN), _limited(text, FILE_SIZE_LIMIT).decode()))
     if (number := content["version"]) != VERSION:
         raise ValueError(f"version {number!r:.20} of the format: this Otolith reads {VERSION}")
+    for item in Decoder(twin).decode(tuple[UnmeasuredInput, ...], content["unmeasured"]):
+        twin = without_sensor(twin, item)
     bundle: Bundle = Decoder(twin).decode(Bundle, content)
     if not bundle.windows:
         raise ValueError("it has no windows")
@@ -289,6 +293,7 @@ class EvidenceWriter(WriterThread):
         super().__init__("evidence", WRITE_RETRY, f"{self.folder}: no evidence of events is kept")
         self.files, self.max_bytes = files_of(machine), machine.file.evidence.max_megabytes * 1_000_000
         self.dropped = 0  # changes of events without a bundle
+        self._unmeasured = machine.unmeasured
         self._key, self._versions = f"{machine.file.machine.site}.{machine.file.machine.name}", versions()
         self._older: tuple[EvidenceWindow, ...] = ()
         self._newer: tuple[EvidenceWindow, ...] = ()
@@ -308,7 +313,9 @@ class EvidenceWriter(WriterThread):
         if events := tuple(announcements(report.document)):
             is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
             self.dropped += is_full
-            bundle = Bundle(VERSION, self._versions, events, self._states[0], (*self._older, *self._newer))
+            bundle = Bundle(
+                VERSION, self._versions, self._unmeasured, events, self._states[0], (*self._older, *self._newer)
+            )
             self._waiting += [] if is_full else [bundle]
             self._wakeup.set()
 

@@ -14,7 +14,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
-from otolith.twin.definition import Definition, Role
+from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.identifiability import structural_identifiability
 from otolith_drivers.base import Link, Sample
 from otolith_drivers.user_dirs import check_writable
@@ -26,7 +26,7 @@ PATIENCE = 4.0  # s to wait for missing signals until the driver gives the cause
 MIN_SHARE = 0.5  # of the samples expected at the sample period; below it "too few" is printed
 PAUSE = 0.1  # s between two looks at the driver
 PROBED = ("can", "modbus")  # drivers that have an 'otolith probe'
-NO_LIMITS = 'none, so no change of it is an event: write {} = {{ watch = ["-10 %", "+10 %"] }} under [parameters]'
+NO_LIMITS = "none, so no change of it is an event: write {} = {{ watch = {} }} under [parameters]"
 FOR_REPLAY_ONLY = "no [driver] and no [signals]: for 'otolith replay' only"
 
 
@@ -96,7 +96,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         bounds = f"from {free.low:g} to {free.high:g} {free.unit}, starting at {free.nominal:g} {free.unit}"
         lines.append(f"estimated: {free.name} {bounds} ({free.meaning}){_origin(free.name, file.parameters)}")
         limits = machine.plan.parameters[free.name].limits_text
-        lines.append(f"limits of {free.name}: {limits or NO_LIMITS.format(free.name)}")
+        lines.append(f"limits of {free.name}: {limits or NO_LIMITS.format(free.name, _example_limits(free))}")
     for name, site in machine.plan.sites.items():
         lines += [f"limits of components at {name}: {site.limits_text}"] if site.limits else []
     for output, noise in zip(twin.outputs, problem.noise, strict=True):
@@ -113,6 +113,13 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
+
+
+def _example_limits(free: Parameter) -> str:
+    """Limits that a person may write: percentages, which a nominal value of zero has not."""
+    if free.nominal:
+        return '["-10 %", "+10 %"]'
+    return f'["{0.5 * free.low:.3g} {free.unit}", "{0.5 * free.high:.3g} {free.unit}"]'
 
 
 def without_sensors(machine: LoadedMachine) -> list[str]:
