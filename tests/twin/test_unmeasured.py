@@ -66,6 +66,18 @@ def test_friction_adds_only_what_the_twin_lacks(name: str, seed: int) -> None:
     assert rates(without, values, seed) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(("name", "own"), [("dc_motor", {"D"}), ("dc_motor_coulomb", {"D", "T_c"})])
+def test_friction_of_the_twin_is_then_that_of_the_load_too(name: str, own: set[str]) -> None:
+    """Limits of the motor alone would be an alarm on the first day."""
+    twin = find_twin(name)
+    without = without_sensor(twin, UnmeasuredInput("T_load", Assumption.FRICTION))
+    for row in twin.parameters:
+        now = without.parameter(row.name)
+        assert (now != row) == (row.name in own)
+        assert now.high > row.high or now == row
+        assert not (now.watch or now.act) or now == row
+
+
 def test_a_twin_without_viscous_friction_gets_it() -> None:
     twin = find_twin("dc_motor")
     bare = replace(
@@ -75,7 +87,8 @@ def test_a_twin_without_viscous_friction_gets_it() -> None:
     )
     without = without_sensor(bare, UnmeasuredInput("T_load", Assumption.FRICTION))
     viscous = without.parameter("T_load_viscous")
-    assert (viscous.low, viscous.unit) == (0.0, "N*m*s")
+    assert viscous.low < 0.0 < viscous.nominal < viscous.high
+    assert viscous.unit == "N*m*s"
     values = nominal(without, T_load_dry=0.0, T_load_viscous=0.00143)
     assert rates(without, values, 1) == pytest.approx(rates(twin, nominal(twin), 1, T_load=0.0))
 

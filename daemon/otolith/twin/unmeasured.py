@@ -156,25 +156,36 @@ def _values(definition: Definition, share: float) -> dict[str, Array]:
 
 
 def _with_friction(definition: Definition, rest: Definition, driven: Input) -> Definition:
-    """Return the twin with friction in place of an input, as far as the twin does not have that friction itself."""
-    frictions = _Frictions(definition, driven)
+    """Return the twin with friction in place of an input, as far as the twin does not have that friction itself.
+
+    The friction that the twin has is then that of the load too: its bounds are wider, and its limits do not hold. That
+    which is added may be slightly negative, so that none is an estimate within the bounds.
+    """
+    frictions, largest = _Frictions(definition, driven), _largest(driven.low, driven.high)
     speed, place = frictions.speed, integral_unit(frictions.speed.unit)
     terms: list[str] = []
     added: list[Parameter] = []
+    viscous = _factor(rest, driven, speed.name, "viscous", "viscous friction in")
     if not frictions.viscous:
-        factor = _factor(rest, driven, speed.name, "viscous", "viscous friction in")
-        added.append(replace(factor, low=0.0))
-        terms.append(f"{factor.name}*{speed.name}")
+        added.append(replace(viscous, low=-viscous.nominal))
+        terms.append(f"{viscous.name}*{speed.name}")
     if not frictions.dry:
         dry, transition = f"{driven.name}_dry", f"{driven.name}_speed"
-        largest = _largest(driven.low, driven.high)
-        meaning = f"dry friction in {driven.meaning}"
-        added.append(Parameter(dry, driven.unit, DRY_SHARE * largest, 0.0, largest, meaning, Role.ESTIMATED))
+        size, meaning = DRY_SHARE * largest, f"dry friction in {driven.meaning}"
+        added.append(Parameter(dry, driven.unit, size, -size, largest, meaning, Role.ESTIMATED))
         low, nominal, high = TRANSITIONS[place]
         meaning = "speed within which dry friction changes sign"
         added.append(Parameter(transition, f"{place}/s", nominal, low, high, meaning))
         terms.append(f"{dry}*tanh({speed.name}/{transition})")
-    return _with_terms(rest, driven, terms, added)
+    of_load = dict.fromkeys(frictions.viscous, viscous.high * to_base(viscous.unit)[0])
+    of_load |= dict.fromkeys(frictions.dry, largest * to_base(driven.unit)[0])
+    wider = tuple(
+        replace(row, high=row.high + of_load[row.name] / to_base(row.unit)[0], watch=(), act=())
+        if row.name in of_load
+        else row
+        for row in rest.parameters
+    )
+    return _with_terms(replace(rest, parameters=wider), driven, terms, added)
 
 
 class _Frictions:
