@@ -9,3 +9,8 @@ import pytest
 def often(chosen: Collection[Any], every: Iterable[Any]) -> list[Any]:
     """Parameters of a test: those not ``chosen`` are marked full."""
     return [value if value in chosen else pytest.param(value, marks=pytest.mark.full) for value in every]
+
+
+def often_rows(chosen: Collection[tuple[Any, ...]], every: Iterable[tuple[Any, ...]]) -> list[Any]:
+    """Rows of several parameters: those not ``chosen`` are marked full."""
+    return [row if row in chosen else pytest.param(*row, marks=pytest.mark.full) for row in every]

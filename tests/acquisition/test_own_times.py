@@ -254,7 +254,7 @@ LOGS = {
 }
 
 
-@pytest.mark.parametrize("name", often(["rows every 10.7 ms", "rows with jitter", "80 % of omega missing"], LOGS))
+@pytest.mark.parametrize("name", often(["rows every 10.7 ms", "80 % of omega missing"], LOGS))
 def test_an_irregular_or_slow_log_is_used_with_valid_intervals(log: Log, name: str) -> None:
     schedule, outcomes = LOGS[name], []
     for seed in (7, 8):

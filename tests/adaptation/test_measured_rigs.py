@@ -15,11 +15,12 @@ from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import load_machine
 from tests.adaptation.measured_like import blamed, cut, reports
+from tests.variants import often, often_rows
 
 PERIOD, RECORDS, SUBSTEPS = 0.02, 100, 20
 WINDOWS, FEW = 14, 6
-SEEDS = pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 9))])
-EXCITATIONS = pytest.mark.parametrize("excitation", ["sine", "steps", pytest.param("stops", marks=pytest.mark.full)])
+SEEDS = pytest.mark.parametrize("seed", often([1], range(1, 9)))
+EXCITATIONS = pytest.mark.parametrize("excitation", often(["steps"], ["sine", "steps", "stops"]))
 TRUTH = {"K": 0.046, "J": 6e-5, "T_c": 0.009}  # of the motor
 RESISTANCE = 2.0  # ohm
 CARRIED, LEFT = 0.98, 0.20  # N*m: load of the winch before and after the window in the middle
@@ -118,7 +119,7 @@ def moved(
 
 
 @SEEDS
-@pytest.mark.parametrize("is_sure", [False, True], ids=("any sensor", "no sensor"))
+@pytest.mark.parametrize("is_sure", often([True], [False, True]), ids=("any sensor", "no sensor"))
 def test_a_load_that_is_put_down_in_the_record_is_followed(tmp_path: Path, seed: int, is_sure: bool) -> None:
     """The noise is that of the same record. An offset of either sensor is the same as another load."""
     extra = "[discovery]\nsensors = []" if is_sure else ""
@@ -168,7 +169,7 @@ def test_torque_ripple_of_a_joint_is_no_sensor_fault(tmp_path: Path, seed: int, 
 
 @SEEDS
 @pytest.mark.parametrize(
-    ("excitation", "level"), [("sine", 0.3), pytest.param("stops", 0.3, marks=pytest.mark.full), ("sine", 0.05)]
+    ("excitation", "level"), often_rows([("sine", 0.3)], [("sine", 0.3), ("stops", 0.3), ("sine", 0.05)])
 )
 def test_noise_of_a_measured_torque_is_named_and_is_no_component(
     tmp_path: Path, seed: int, excitation: str, level: float

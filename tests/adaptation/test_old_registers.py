@@ -11,6 +11,7 @@ from benchmarks.sampling.schedules import NOISE, OUTPUTS, Schedule, Timing
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import Status
 from otolith.machine import load_machine
+from tests.variants import often
 
 PERIOD, WINDOW, WINDOWS, STEPPED = 0.01, 2.0, 12, 5  # s; windows, and the one with the only step of the voltage
 RESTING, STEP, LOAD = 12.0, 10.0, 0.02  # V, V, N·m
@@ -39,7 +40,7 @@ def table(seed: int, late_for: float) -> str:
     return "\n".join(["t,V_a,T_load,i,omega", *lines, ""])
 
 
-@pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.full)])
+@pytest.mark.parametrize("seeds", often([1], [1, 20]))
 @pytest.mark.parametrize("late_for", [0.1, 0.6, WINDOW * WINDOWS])
 def test_an_age_that_jumps_near_a_step_moves_no_estimate_and_adds_no_component(
     late_for: float, seeds: int, tmp_path: Path

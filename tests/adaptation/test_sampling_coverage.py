@@ -14,16 +14,12 @@ from scipy.integrate import solve_ivp
 
 from otolith.acquisition.window import Array
 
-SHORT = (
-    "omega every 50 ms",
-    "samples 80 % missing",
-    "rows 30 % missing, commands on change",
-    "rows every 10.7 ms",
-    "100 ms, 80 % missing",
-    "polled every 21 ms",
-)
+SHORT = ("omega every 50 ms", "rows 30 % missing, commands on change", "polled every 21 ms")
 FULL = (
     *SHORT,
+    "samples 80 % missing",
+    "rows every 10.7 ms",
+    "100 ms, 80 % missing",
     "uniform rows",
     "i every 100 ms",
     "inputs every 50 ms",

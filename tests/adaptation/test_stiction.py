@@ -65,7 +65,8 @@ def sine_windows(seed: int) -> list[Window]:
     return cut(("u", "omega"), values, RECORDS, PERIOD)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 10))])
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(10))
 def test_stiction_is_neither_a_delay_nor_another_inertia(tmp_path: Path, seed: int) -> None:
     file = tmp_path / "stiction.toml"
     file.write_text(TWIN, encoding="utf-8")

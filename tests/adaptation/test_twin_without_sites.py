@@ -15,6 +15,7 @@ from otolith.twin.language import read_twin
 from otolith_drivers.config_files import read
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import Fault, Step, Unbalance
+from tests.variants import often
 
 Cut = Callable[..., list[tuple[Window, float]]]
 FAULTS: dict[str, tuple[Fault, ...]] = {
@@ -24,7 +25,7 @@ FAULTS: dict[str, tuple[Fault, ...]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", often(["step"], FAULTS))
 def test_a_twin_without_sites_is_estimated(tmp_path: Path, scenario: MotorScenario, windows: Cut, fault: str) -> None:
     text, sites, _ = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8").partition("[sites]")
     assert sites

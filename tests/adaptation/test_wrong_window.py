@@ -16,6 +16,7 @@ from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
 from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.variants import often
 
 Cut = Callable[..., list[tuple[Window, float]]]
 MOTOR = find_twin("dc_motor")
@@ -81,9 +82,9 @@ def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
 @pytest.mark.parametrize(
-    "free", [("R_a",), pytest.param(("R_a", "D"), marks=pytest.mark.full), ("R_a", "L_a", "J", "D")], ids=len
+    "free", often([("R_a", "L_a", "J", "D")], [("R_a",), ("R_a", "D"), ("R_a", "L_a", "J", "D")]), ids=len
 )
-@pytest.mark.parametrize("at", [0, pytest.param(1, marks=pytest.mark.full), 5])
+@pytest.mark.parametrize("at", often([0], [0, 1, 5]))
 def test_a_wrong_window_is_given_up(
     wrong: Callable[[Array], Array], free: tuple[str, ...], at: int, scenario: MotorScenario, windows: Cut
 ) -> None:
@@ -119,7 +120,7 @@ def test_windows_that_are_wrong_now_and_then_move_no_estimate(
 
 
 @pytest.mark.parametrize("wrong", [1, 3])
-@pytest.mark.parametrize("seed", [2, 7, *(pytest.param(seed, marks=pytest.mark.full) for seed in (0, 1, 3, 4, 5, 6))])
+@pytest.mark.parametrize("seed", often([2], range(8)))
 def test_windows_that_no_hypothesis_explains_leave_no_doubt(
     seed: int, wrong: int, scenario: MotorScenario, windows: Cut
 ) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 from otolith.acquisition.window import Array
@@ -69,6 +70,7 @@ def write_log(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.full
 def test_jitter_of_the_rows_is_no_process_noise(tmp_path: Path) -> None:
     (tmp_path / "joint.toml").write_text(TWIN, encoding="utf-8")
     (tmp_path / "machine.toml").write_text(MACHINE, encoding="utf-8")

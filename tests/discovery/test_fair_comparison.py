@@ -160,6 +160,7 @@ def test_samples_of_a_structure_that_nothing_explains_are_no_independent_evidenc
     assert fast < 1.5 * slow
 
 
+@pytest.mark.full
 def test_a_gain_of_the_speed_is_a_cause_beside_all_parameters_on_a_sine() -> None:
     """A tenth of the speed is lost, as if K, J and T_c had moved. Shapes that depend on the voltage score far better.
 

@@ -8,6 +8,7 @@ from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.health.schema import ReportDocument
 from tests.adaptation.measured_like import NOISE, PERIOD, RECORDS, SIGNALS, TRUTH, motor_problem, reports
+from tests.variants import often
 
 TORQUE, RIPPLE, ECCENTRICITY = 0.02, 0.4, 0.01  # N·m, rad/s, and of the speed: about the same at constant speed
 HEALTHY, WINDOWS, VERDICT_WINDOWS = 2, 9, 5
@@ -59,7 +60,7 @@ def turning(
 
 @SEEDS
 @ERRORS
-@pytest.mark.parametrize("sensors", [ONE, BOTH], ids=len)
+@pytest.mark.parametrize("sensors", often([BOTH], [ONE, BOTH]), ids=len)
 def test_a_speed_that_changes_shows_an_error_of_its_sensor(
     seed: int, ripple: float, eccentricity: float, sensors: tuple[str, ...]
 ) -> None:

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
-HOUR, DAY = 60, 24 * 60  # failures
+from tests.variants import often
+
+FEW, HOUR, DAY = 20, 60, 24 * 60  # failures
 
 PROGRAM = """
 import gc, json, sys, time
@@ -60,7 +62,7 @@ def flap(name: str, flaps: int) -> Any:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("flaps", [HOUR, pytest.param(DAY, marks=pytest.mark.full)])
+@pytest.mark.parametrize("flaps", often([FEW], [FEW, HOUR, DAY]))
 @pytest.mark.parametrize("name", ["can", "modbus"])
 def test_flapping_leaves_nothing_behind(name: str, flaps: int) -> None:
     result = flap(name, flaps)

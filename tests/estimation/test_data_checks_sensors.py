@@ -16,7 +16,7 @@ from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import Step
-from tests.variants import often
+from tests.variants import often, often_rows
 
 Cut = Callable[..., list[tuple[Window, float]]]
 Change = Callable[[Array], Array]
@@ -92,6 +92,7 @@ def test_faulty_sensor_does_not_update_the_posterior(
 
 TRUE = {"R_a": 6.5, "D": 0.00143}  # Ω, N·m·s/rad
 DEVIATIONS = 4.0  # standard deviations: several hundred values are compared
+LASTING = ("gain of the current", ("R_a", "D"))
 LASTING_FAULTS: dict[str, tuple[str, Change]] = {
     "gain of the current": ("i", lambda values: 1.05 * values),
     "offset of the current": ("i", lambda values: values + 0.05),
@@ -101,7 +102,7 @@ LASTING_FAULTS: dict[str, tuple[str, Change]] = {
 
 @pytest.mark.parametrize(
     ("fault", "names"),
-    [*((fault, ("R_a",)) for fault in LASTING_FAULTS), ("gain of the current", ("R_a", "D"))],
+    often_rows([LASTING], [*((fault, ("R_a",)) for fault in LASTING_FAULTS), LASTING]),
     ids=str,
 )
 def test_lasting_sensor_fault_is_never_a_parameter_step(

@@ -318,7 +318,7 @@ VALUES: st.SearchStrategy[object] = (
 FACTORS = st.sampled_from([-1.0, 0.0, 1e-30, 0.5, 2.0, 1e3, 1e30])
 
 
-SHORT = settings(max_examples=30)
+SHORT = settings(max_examples=15)
 LONG = settings(SHORT, max_examples=150)
 
 
