@@ -34,11 +34,10 @@ SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no
 test: $(DEV)
 	$(SHARED) -m "not full and not timed"
 
-# Full tests wait for real time more than others, so they get more processes. Timed tests run last and one at a time,
-# with exact limits.
-test-full: WORKERS = $(shell expr 3 \* $$(nproc))
+# Timed tests run last and one at a time, with exact limits. LONG="not timed" runs the tests of make test as well.
+LONG = full and not timed
 test-full: $(DEV)
-	@$(SHARED) -m "full and not timed"; shared=$$?; \
+	@$(SHARED) -m "$(LONG)"; shared=$$?; \
 	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed; timed=$$?; exit $$((shared | timed))
 
 system-test: $(DEV)
