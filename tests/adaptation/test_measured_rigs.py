@@ -141,6 +141,7 @@ def test_a_load_that_is_put_down_in_the_record_is_followed(tmp_path: Path, seed:
     assert not blamed(documents) or not is_sure
 
 
+@pytest.mark.full
 @SEEDS
 @EXCITATIONS
 def test_a_lab_motor_without_a_current_sensor_has_no_sensor_fault(tmp_path: Path, seed: int, excitation: str) -> None:
@@ -154,6 +155,7 @@ def test_a_lab_motor_without_a_current_sensor_has_no_sensor_fault(tmp_path: Path
         assert documents[-1].parameters[name].value == pytest.approx(truth, rel=0.03)
 
 
+@pytest.mark.full
 @SEEDS
 @EXCITATIONS
 def test_torque_ripple_of_a_joint_is_no_sensor_fault(tmp_path: Path, seed: int, excitation: str) -> None:
@@ -167,6 +169,7 @@ def test_torque_ripple_of_a_joint_is_no_sensor_fault(tmp_path: Path, seed: int, 
     assert not blamed(documents) & {"T_m", "q"}
 
 
+@pytest.mark.full
 @SEEDS
 @pytest.mark.parametrize(
     ("excitation", "level"), often_rows([("sine", 0.3)], [("sine", 0.3), ("stops", 0.3), ("sine", 0.05)])

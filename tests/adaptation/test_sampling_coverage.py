@@ -52,7 +52,7 @@ def assert_valid_and_efficient(summary: Summary) -> None:
 
 @pytest.mark.parametrize("case", SHORT)
 def test_windows_are_estimated_with_valid_intervals_near_the_bound(case: str) -> None:
-    assert_valid_and_efficient(measured(CASES[case], windows=60, seed=1))
+    assert_valid_and_efficient(measured(CASES[case], windows=40, seed=1))
 
 
 @pytest.mark.full
@@ -61,7 +61,7 @@ def test_250_windows_are_estimated_with_valid_intervals_near_the_bound(case: str
     assert_valid_and_efficient(measured(CASES[case], windows=250, seed=1))
 
 
-@pytest.mark.parametrize(("windows", "cases"), [(60, SHORT), pytest.param(250, FULL, marks=pytest.mark.full)])
+@pytest.mark.parametrize(("windows", "cases"), [(40, SHORT), pytest.param(250, FULL, marks=pytest.mark.full)])
 def test_intervals_of_all_scenarios_hold_the_truth_in_95_percent(windows: int, cases: tuple[str, ...]) -> None:
     """The published intervals may be wider: they allow for parameters that drift."""
     summaries = [measured(CASES[case], windows=windows, seed=1) for case in cases]

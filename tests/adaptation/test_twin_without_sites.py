@@ -25,6 +25,7 @@ FAULTS: dict[str, tuple[Fault, ...]] = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("fault", often(["step"], FAULTS))
 def test_a_twin_without_sites_is_estimated(tmp_path: Path, scenario: MotorScenario, windows: Cut, fault: str) -> None:
     text, sites, _ = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8").partition("[sites]")

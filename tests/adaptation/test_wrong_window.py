@@ -139,6 +139,7 @@ def test_windows_that_no_hypothesis_explains_leave_no_doubt(
         assert abs(resistance.value - TRUTH["R_a"]) <= SDS * resistance.sd, document.window.index
 
 
+@pytest.mark.full
 def test_nothing_is_estimated_from_what_no_hypothesis_explains(scenario: MotorScenario, windows: Cut) -> None:
     state, unexplained = initial_state("motor", "bench", problem_of(("R_a", "D"))), 0
     for window, _ in windows(scenario.model_copy(update={"faults": ()}), WINDOWS):

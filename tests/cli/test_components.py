@@ -163,7 +163,7 @@ def test_commission_without_an_answer_keeps_nothing(
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     with pytest.raises(click.Abort):
-        cli.main(["commission", str(MACHINE), str(data), "--windows", "4"], standalone_mode=False)
+        cli.main(["commission", str(MACHINE), str(data), "--windows", "2"], standalone_mode=False)
     assert "nothing is kept" in capsys.readouterr().err
     assert store().decisions() == OperatorDecisions()
     assert store().components() == ()
@@ -287,7 +287,7 @@ def test_commission_replays_with_the_levels_of_the_file_unless_they_explain_no_w
 
 @pytest.mark.usefixtures("commissioned")
 def test_commission_keeps_what_was_learned_before_beside(data: Path) -> None:
-    result = otolith("commission", MACHINE, data, "--windows", "4", answer="y\n")
+    result = otolith("commission", MACHINE, data, "--windows", "2", answer="y\n")
     (kept,) = store().components_path.parent.glob("*.kept.json")
     assert f"what was learned before is kept as {kept}" in result.stderr
 

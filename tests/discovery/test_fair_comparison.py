@@ -30,10 +30,12 @@ from otolith.estimation.information import Prior, forget_parameter, initial_prio
 from otolith.estimation.problem import Component, Problem
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
+from tests.variants import often
 
 MOTOR = find_twin("dc_motor")
 
 
+@pytest.mark.full
 def test_a_step_whose_fit_reaches_another_minimum_is_no_component() -> None:
     """Friction that changes its sign makes the fit of F_v alone fail, where an equivalent component explains the step.
 
@@ -62,7 +64,7 @@ def test_a_stiffness_that_moved_far_is_no_periodic_torque(run: int) -> None:
     assert decisions == [*[WindowDecision.LEARNED] * 4, WindowDecision.SUSPECTED, WindowDecision.STEPPED]
 
 
-@pytest.mark.parametrize("number", [17, 20])
+@pytest.mark.parametrize("number", often([20], [17, 20]))
 def test_the_error_of_the_integrator_is_no_evidence(number: int) -> None:
     """Speed crosses zero where dry friction needs short steps; a fit that starts beside it must not keep long ones."""
     (trial,) = (own for own in classes.trials(12, 12) if own.case.name == "J / gain of omega: J -20 %")

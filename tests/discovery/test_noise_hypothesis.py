@@ -84,6 +84,7 @@ def test_a_step_of_a_parameter_is_no_noise() -> None:
     assert all(document.decision is not WindowDecision.NOISIER for document in documents)
 
 
+@pytest.mark.full
 def test_noise_of_a_measured_input_is_named_and_no_component_is_adopted() -> None:
     """The noise of the pump's throttle position, which nothing states, colours the innovations."""
     (case,) = cases(24, ["pump: load noise"])

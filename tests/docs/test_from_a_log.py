@@ -379,6 +379,7 @@ def test_the_delay_of_a_speed_from_counts_is_identified(folder: Path, monkeypatc
     assert float(delay) == pytest.approx(10.0, abs=1.0)
 
 
+@pytest.mark.full
 def test_more_friction_is_followed_and_no_sensor_is_blamed(folder: Path) -> None:
     documents = reports(folder, "bench.toml", "worn")
     change = next(at for at, document in enumerate(documents) if document.window.end > 20.01)

@@ -112,6 +112,7 @@ def test_the_delay_of_a_signal_is_subtracted_once(
     assert_same(first, again, share=0.1)
 
 
+@pytest.mark.full
 def test_two_replays_of_a_recording_are_identical(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reports(recording, capsys) == reports(recording, capsys)
     text = summed_up(recording, capsys)

@@ -125,6 +125,7 @@ def test_the_evidence_of_a_killed_daemon_is_reproduced_by_another_process(start:
     assert "the same to the last bit: " in done.stdout
 
 
+@pytest.mark.full
 def test_a_second_daemon_of_the_same_name_ends_with_an_error(start: Start, healthy: OwnMachine) -> None:
     first = start()
     command = [*OTOLITH, "run", str(healthy.machine), "--listen", "tcp/127.0.0.1:0"]
@@ -164,6 +165,7 @@ def test_unreadable_decisions_do_not_cost_the_learned_state(start: Start, store:
     assert store.decisions_path.read_text(encoding="utf-8") == "half a fi"
 
 
+@pytest.mark.full
 def test_a_reset_reaches_a_running_daemon(start: Start, healthy: OwnMachine, store: StateStore) -> None:
     running = start()
     running.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))

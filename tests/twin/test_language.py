@@ -187,9 +187,12 @@ FORMULAS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("formula", FORMULAS)
-def test_every_kind_of_formula_is_compiled_right(formula: str) -> None:
-    """Value and derivatives of an output agree with Python's evaluation of the text and its differences."""
+@pytest.mark.parametrize("first", range(0, len(FORMULAS), 4))
+def test_every_kind_of_formula_is_compiled_right(first: int) -> None:
+    """Value and derivatives of outputs agree with Python's evaluation of their texts and its differences."""
+    names = {f"y_{index}": formula for index, formula in enumerate(FORMULAS[first : first + 4])}
+    outputs = "\n".join(f'{name} = {{ unit = "1", noise = 1, meaning = "output" }}' for name in names)
+    equations = "\n".join(f'{name} = "{formula}"' for name, formula in names.items())
     page = f"""
 [twin]
 name = "any"
@@ -200,14 +203,14 @@ x = {{ unit = "1", meaning = "state", initial = 1.3, bounds = [-10, 10] }}
 [inputs]
 u = {{ unit = "1", hold = "zoh", meaning = "input" }}
 [outputs]
-y = {{ unit = "1", noise = 1, meaning = "output" }}
+{outputs}
 [parameters]
 a = {{ unit = "1", nominal = 0.7, bounds = [0, 5], meaning = "a" }}
 b = {{ unit = "1", nominal = 1.9, bounds = [0, 5], meaning = "b" }}
 k = {{ unit = "1/s", nominal = 0.3, bounds = [0, 5], meaning = "rate" }}
 [equations]
 "der(x)" = "-k*x + 0*k*u*a*b"
-y = "{formula}"
+{equations}
 """
     twin = read_twin(SourceFile(Path("any.toml"), page))
     parameters, initial = np.array([0.7, 1.9, 0.3]), np.array([1.3])
@@ -233,8 +236,8 @@ def test_definitions_that_grow_too_large_are_refused() -> None:
 
 
 def test_only_checked_names_reach_generated_code() -> None:
-    page = BASE.replace('title = "', 'title = "\\"\\"\\"\\nINJECTED ').replace('source = "', 'source = "INJECTED ')
+    page = BASE.replace('title = "', 'title = "\\"\\"\\" INJECTED ').replace('source = "', 'source = "INJECTED ')
     assert "INJECTED" not in kernel_source(read_twin(SourceFile(Path("any.toml"), page)))
     for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
-        with pytest.raises(ConfigurationError, match="is not a name"):
+        with pytest.raises(ConfigurationError, match=r"is not a name|control character"):
             read_twin(SourceFile(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))

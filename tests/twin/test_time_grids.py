@@ -1,6 +1,7 @@
 """Kernels at records of any times, against dense uniform grids, differences and simulated noise."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -217,10 +218,11 @@ def test_innovations_have_the_covariance_of_simulated_noise() -> None:
 
 def moved(states: Array, inputs: Array) -> Array:
     """(paths, states) after a period of the dense grid; the motor is linear, so two matrices do it."""
-    transition, effect, constant = MATRICES
+    transition, effect, constant = _matrices()
     return np.asarray(states @ transition.T + inputs @ effect.T + constant)
 
 
+@cache
 def _matrices() -> tuple[Array, Array, Array]:
     def after(state: Array, driving: Array) -> Array:
         drive = Excitation.uniform(np.tile(driving, (2, 1)), PERIOD, 2)
@@ -230,9 +232,6 @@ def _matrices() -> tuple[Array, Array, Array]:
     transition = np.column_stack([after(unit, np.zeros(2)) - rest for unit in np.eye(2)])
     effect = np.column_stack([after(np.zeros(2), unit) - rest for unit in np.eye(2)])
     return transition, effect, rest
-
-
-MATRICES = _matrices()
 
 
 def test_records_without_measurements_change_nothing() -> None:
