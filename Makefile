@@ -12,7 +12,7 @@ PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constra
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
-	@echo "make test    run the tests, long ones left out: six minutes on two cores"
+	@echo "make test    run the tests, long ones left out: four minutes on two cores"
 	@echo "make test-full"
 	@echo "             the long tests, and those that time something, one at a time: twenty minutes"
 	@echo "make system-test"
