@@ -36,6 +36,7 @@ from otolith.health.schema import (
 )
 from otolith.health.text import event_text
 from otolith.machine import load_rules
+from tests.messages import assert_says
 from tests.variants import often
 
 NOMINAL, WATCH, ACT = 6.5, 6.3, 6.0  # ohm
@@ -356,8 +357,8 @@ def test_a_known_parameter_that_has_moved_is_judged_by_the_limits_of_the_twin(
     assert [item[2] for item in changes(documents)] == expected
     if expected:
         event = events(documents[-1])["magnets"]
-        assert event.condition == "the magnetic field of the motor has dropped at once"
         assert "34.000 ± 0.020 mN·m/A (-10.5%), stated as 38 mN·m/A" in event.text
+        assert_says(event.condition, "magnetic field", "dropped")
 
 
 def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:
@@ -391,7 +392,7 @@ def test_a_sine_of_time_that_proves_to_be_one_of_the_angle_is_the_same_event() -
     assert [item[:2] for item in changes(documents)] == [(2, EventChange.RAISED), (agreed, EventChange.CHANGED)]
     first, last = events(documents[5])["shaft"], events(documents[-1])["shaft"]
     assert first.id == last.id
-    assert first.condition == "machine unsteadiness or an unbalanced or misaligned shaft at a constant speed"
+    assert_says(first.condition, "unsteadiness", "unbalanced", "misaligned shaft")
     assert "run at another speed" in first.advice
     assert last.condition == "unbalanced shaft"
 
@@ -416,7 +417,7 @@ def test_a_value_that_never_was_inside_may_be_a_wrong_nominal_value() -> None:
     beyond = assessed(report(index, 5.8) for index in range(5))[-1]
     assert events(beyond)["winding"].condition.startswith("a nominal value that does not fit")
     was_inside = assessed(report(index, 6.5 if index < 3 else 5.8) for index in range(9))[-1]
-    assert events(was_inside)["winding"].condition == "short circuit between turns of the winding"
+    assert_says(events(was_inside)["winding"].condition, "short circuit", "winding")
 
 
 def test_the_values_distinguish_a_sudden_change_from_a_slow_one() -> None:
@@ -424,7 +425,7 @@ def test_the_values_distinguish_a_sudden_change_from_a_slow_one() -> None:
     step += [report(5, 5.8, decision=WindowDecision.STEPPED), *[report(index, 5.8) for index in range(6, 12)]]
     slow = [report(index, max(6.5 - 0.02 * index, 5.8)) for index in range(60)]
     causes = [events(assessed(reports)[-1])["winding"].cause for reports in (step, slow)]
-    assert causes[0] == "the insulation has broken down at once"
+    assert_says(causes[0], "insulation", "at once")
     assert causes[1].startswith("the insulation between turns fails slowly")
 
 
@@ -449,7 +450,7 @@ def test_a_trend_is_an_event_before_the_limit_is_reached() -> None:
     documents = assessed(falling(6.0, 0.9))
     (raised,) = [event for document in documents for event in document.events if event.change is EventChange.RAISED]
     assert (raised.part, raised.state) == ("winding", Level.WATCH)
-    assert raised.condition == "a parameter is on its way to a limit"
+    assert_says(raised.condition, "parameter", "on its way to a limit")
     assert "reaches WATCH in" in raised.text
     assert state_of(documents[-1], "winding") is Level.WATCH
 

@@ -22,6 +22,7 @@ from otolith_drivers.modbus.schedule import (
     split,
 )
 from tests.drivers.registers import KINDS, item
+from tests.messages import assert_says
 
 register_places = st.lists(
     st.tuples(st.integers(1, 2), st.sampled_from(["holding", "input"]), st.integers(0, 300), st.sampled_from(KINDS)),
@@ -95,7 +96,7 @@ def test_period_is_kept_or_lengthened_to_what_fits() -> None:
         now += 0.004
         schedule.end(0.004, repeated=False)
     assert schedule.period == 0.01
-    assert schedule.describe_period() == "read every 10 ms again, as asked"
+    assert_says(schedule.describe_period(), "10 ms", "as asked")
 
 
 def test_busy_computer_does_not_change_the_period() -> None:
@@ -197,7 +198,7 @@ def test_registers_are_named_as_the_machine_file_counts_them() -> None:
     signal = register_signal(Signal("a", "V", source), ModbusOptions(host="localhost", first_address=1))
     (request,) = plan([signal], 0, 125)
     assert request.address == 102
-    assert request.describe() == "device 1, holding registers 103 to 104"
+    assert_says(request.describe(), "device 1", "holding", "103 to 104")
 
 
 def test_least_time_counts_serial_characters() -> None:
