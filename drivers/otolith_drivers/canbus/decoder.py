@@ -168,6 +168,8 @@ class MessageReader:
             return [f"{self.title} has not come once in {waited:.1f} s"] if waited > limit else []
         rejections = self._rejections.values() if unused else ()
         lines = [line for rejection in rejections for line in rejection.warnings(now, self.title)]
+        if self._counter is not None and self._counter.is_random:
+            lines.append(self._random_counter(self._counter))
         if self._counter is not None and self._counter.repeated >= MIN_STUCK_FRAMES:
             lines.append(self._stuck_counter(self._counter))
         elif (silence := self.periods.silence(now)) is not None:
@@ -257,6 +259,11 @@ class MessageReader:
     def _count_rejection(self, kind: str, time: float, text: str) -> None:
         self.bad += 1
         self._rejections[kind].note(text, time)
+
+    def _random_counter(self, counter: FrameCounter) -> str:
+        name = self.title.split()[0]
+        line = f"the counter {counter.name} of {self.title} jumps at random and is not used: it is no counter"
+        return f"{line} (set driver.messages.{name}.counter = false), or two nodes send the message"
 
     def _stuck_counter(self, counter: FrameCounter) -> str:
         line = f"the counter {counter.name} of {self.title} has not changed for {counter.repeated} frames"

@@ -14,10 +14,12 @@ from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
 from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable, RawReader, bytes_needed, raw_reader
-from otolith_drivers.common.message_times import PeriodEstimator
+from otolith_drivers.common.message_times import EARLY, LATE, MAX_OUTAGE, PeriodEstimator
 
 # Thresholds; docs/reference/thresholds-canbus.md gives the origin of each.
 MIN_COUNTER_RUN = 9  # steps of one in a row before a signal is used as a counter because of its name
+MIN_JUMPS = 16  # jumps more than steps of one, after which a counter is none
+SLACK = 2.0  # frames more than the period allows that a counter may show, because of jitter
 MIN_STUCK_FRAMES = 3  # repeated frames before a counter is reported as stuck
 ERROR_SHOWN, STATE_SHOWN = 10.0, 60.0  # s after the last error frame; s after the last report of a controller state
 
@@ -45,11 +47,15 @@ class FrameCounter:
         self.modulo = modulo or _modulo(signal)
         self.needed = bytes_needed(signal)  # Bytes of a frame that contains it
         self.repeated = 0  # Frames in a row that have repeated the last count
+        self.is_random = False  # Whether it has jumped too often to be a counter, and has not counted since
         self._read: RawReader = raw_reader(signal)
         self._trusted = declared
         self._run = 0
         self._last: int | None = None
         self._corrupted = 0
+        self._budget = 0.0  # Frames that may have been sent, by the clock, beside those that were counted
+        self._jumps = 0  # Steps that were none of a counter, less those that were
+        self._waiting = 0  # Lost frames that count when the counter has shown to be one
 
     def note_corrupted(self) -> None:
         """Count a frame whose counter cannot be read: it was sent and did arrive, so it is not lost."""
@@ -63,7 +69,10 @@ class FrameCounter:
         if not self._trusted:
             self._run = self._run + 1 if step == 1 else 0
             self._trusted, self._corrupted = self._run >= MIN_COUNTER_RUN, 0
+            self.is_random &= not self._trusted
             return periods.lost_before(time)
+        interval = 0.0 if periods.last is None else time - periods.last
+        period = periods.period if periods.regular else None
         sent = periods.sent_since_last(time, step, self.modulo)
         if sent == 0:
             self.repeated += 1
@@ -72,6 +81,30 @@ class FrameCounter:
         lost = sent - 1
         if self._corrupted:
             lost, self._corrupted = max(0, lost - self._corrupted), 0
+        return self._credible(lost, interval, period)
+
+    def _credible(self, lost: int, interval: float, period: float | None) -> int:
+        """Return how many of ``lost`` frames count now, ``interval`` s after the frame before.
+
+        A counter that shows more frames than the period allows jumps. Without a known period every loss may be a jump:
+        then it counts when the counter has counted again. One that jumps in most frames is no counter.
+        """
+        if period is None:
+            is_jump, self._budget = lost > 0, 0.0
+        else:
+            frames = interval / period if interval < MAX_OUTAGE else 0.0
+            self._budget += frames
+            is_jump = lost > self._budget + SLACK
+            lost = max(0, round(frames) - 1) if is_jump else lost
+            self._budget = max(-SLACK, self._budget - lost - 1)
+            if not lost and EARLY <= frames <= LATE:  # nothing is held up any more
+                self._budget = min(self._budget, SLACK)
+        self._jumps = max(0, self._jumps + (1 if is_jump else -1))
+        if self._jumps >= MIN_JUMPS:
+            self.is_random, self._trusted, self._run, self._jumps, self._waiting = True, False, 0, 0, 0
+            return 0
+        if period is None:
+            lost, self._waiting = (lost + self._waiting, 0) if not self._jumps else (0, lost + self._waiting)
         return lost
 
 

@@ -19,10 +19,12 @@ MAX_DRIFT = 2e-4  # s per s between two clocks, beyond the 1e-4 of two quartz os
 BLOCK = 10.0  # s; the fastest message of the last one or two of these gives the offset of a clock that is not asked
 SET_BACK = 2.0  # s; for which a clock that is not asked must be behind to count as one that was set back
 MIN_INTERVALS, MIN_SPAN, MAX_INTERVALS = 8, 0.25, 4096  # intervals; s; intervals: what a period estimate takes
+AGREEING = 0.8  # least ratio of two periods in a row that are the same
 MIN_REGULAR_SHARE = 0.75  # of the intervals of a regular message are on time
 EARLY, LATE = 0.5, 1.5  # periods: half-way to the frame before and to the frame after
 TRACKING_GAIN = 0.02  # of the difference, with each frame: cheap oscillators drift
-MAX_OUTLIERS = 32  # intervals in a row that are not on time; then the period is estimated anew
+OUTLIER_WEIGHT = 3  # intervals on time for each that is not: the share that a regular message has at least
+MAX_OUTLIERS = 96  # of that weight; then the period is estimated anew
 MAX_OUTAGE = 60.0  # s; a longer silence is a stop of the sender, not a loss of frames
 SILENT_PERIODS, MIN_SILENCE, MIN_IRREGULAR_SILENCE = 10.0, 0.5, 10.0  # periods; s; s
 
@@ -140,6 +142,7 @@ class PeriodEstimator:
         self.last: float | None = None  # Arrival (s) of the last new frame
         self._declared = declared is not None
         self._intervals: list[float] = []
+        self._candidate: float | None = None  # Period (s) that the last intervals had, if they were regular
         self._outliers = 0
         self._unconfirmed = 0
         self._held_up = 0
@@ -223,7 +226,7 @@ class PeriodEstimator:
 
     def _accept(self, interval: float, unconfirmed: int = 0) -> int:
         """Track an interval that is on time; returns the frames that it confirms as lost."""
-        self._outliers = 0
+        self._outliers = max(0, self._outliers - 1)
         if not self._declared and self.period is not None:
             self.period += TRACKING_GAIN * (interval - self.period)
         confirmed, self._unconfirmed = self._unconfirmed, unconfirmed
@@ -231,7 +234,7 @@ class PeriodEstimator:
 
     def _count_outlier(self) -> bool:
         """Count an interval that is not on time; True if the estimate starts anew because of it."""
-        self._outliers += 1
+        self._outliers += OUTLIER_WEIGHT
         if self._outliers < MAX_OUTLIERS or self._declared:
             return False
         self.period, self.regular, self._outliers, self._unconfirmed = None, False, 0, 0
@@ -239,9 +242,13 @@ class PeriodEstimator:
 
     def _learn(self, interval: float) -> None:
         self._intervals.append(interval)
-        if (estimate := estimate_period(self._intervals)) is not None:
-            self.period, self.regular = estimate
-            self._intervals.clear()
+        if (estimate := estimate_period(self._intervals)) is None:
+            return
+        self._intervals.clear()
+        period, is_regular = estimate
+        before, self._candidate = self._candidate, period if is_regular else None
+        agrees = before is not None and AGREEING * before <= period <= before / AGREEING
+        self.period, self.regular = period, is_regular and agrees
 
 
 def estimate_period(intervals: Sequence[float]) -> tuple[float, bool] | None:

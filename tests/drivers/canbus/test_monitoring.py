@@ -2,6 +2,7 @@
 
 import math
 import struct
+from collections.abc import Iterable
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -62,6 +63,40 @@ def test_lost_frames_are_counted_exactly(tmp_path: Path, options: dict[str, Any]
     assert frame_decoder.counters.lost == 2 * lost
     assert frame_decoder.counters.received == 400
     assert frame_decoder.counters.bad == 0
+
+
+@pytest.mark.parametrize("options", [COUNTED, {}], ids=["declared", "recognised"])
+@pytest.mark.parametrize("jitter", [0.0, 0.2, 5.0], ids=["regular", "with jitter", "irregular"])
+def test_a_counter_that_jumps_at_random_is_named_and_counts_no_losses(
+    tmp_path: Path, options: dict[str, Any], jitter: float
+) -> None:
+    """After it has counted for a while; and when it counts again, it is used again."""
+    frame_decoder, random, time = motor(tmp_path, **options), Random(1), 0.0  # noqa: S311 - no secret
+
+    def send_counts(counts: Iterable[int]) -> None:
+        nonlocal time
+        for count in counts:
+            late = random.uniform(-jitter, jitter) if jitter < 1.0 else random.expovariate(1.0 / jitter)
+            time += PERIOD * (1.0 + late)
+            send(frame_decoder, 0, time, count=count)
+
+    send_counts(range(400))
+    assert not any("random" in line for line in frame_decoder.warnings(time))
+    send_counts(random.randrange(256) for _ in range(5000))
+    named = [line for line in frame_decoder.warnings(time) if "random" in line]
+    assert_each_says(named, ("AliveCounter", "Motor", "counter = false"))
+    assert frame_decoder.counters.lost < (100 if jitter < 1.0 else 1000)  # some irregular intervals look regular
+    send_counts(range(100))
+    assert not any("random" in line for line in frame_decoder.warnings(time))
+
+
+@pytest.mark.parametrize("lost", [1, 5, 40, 200])
+def test_losses_of_an_irregular_message_are_counted_by_its_counter(tmp_path: Path, lost: int) -> None:
+    frame_decoder, random, time = motor(tmp_path, **COUNTED), Random(1), 0.0  # noqa: S311 - no secret
+    for index in [*range(400), *range(400 + lost, 500 + lost)]:
+        time += random.expovariate(20.0)
+        send(frame_decoder, index, time)
+    assert frame_decoder.counters.lost == 2 * lost
 
 
 @settings(deadline=None)
@@ -174,9 +209,17 @@ def test_a_message_is_regular_if_most_intervals_are(pattern: list[float], regula
 
 
 def test_gaps_at_the_start_do_not_change_the_estimate() -> None:
-    periods, _ = received([0.6, 0.6, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3])
+    periods, _ = received([0.6, 0.6, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3] + [0.3] * 8)
     assert periods.period == pytest.approx(0.3)
     assert periods.regular
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_message_at_random_times_counts_hardly_any_losses(seed: int) -> None:
+    """By chance, intervals may look regular for a while: then long ones would count as losses."""
+    random = Random(seed)  # noqa: S311 - no secret
+    _, lost = received([random.expovariate(20.0) for _ in range(5000)])
+    assert lost < 100
 
 
 def test_several_gaps_in_a_row_keep_the_period() -> None:
@@ -185,13 +228,13 @@ def test_several_gaps_in_a_row_keep_the_period() -> None:
 
 def test_a_stuck_counter_delivers_nothing_and_is_a_warning(tmp_path: Path) -> None:
     frame_decoder = motor(tmp_path, **COUNTED)
-    send_all(frame_decoder, range(50))
-    given = [send(frame_decoder, index, count=49) for index in range(50, 60)]
+    send_all(frame_decoder, range(60))
+    given = [send(frame_decoder, index, count=59) for index in range(60, 70)]
     assert given == [0] * 10
-    assert (frame_decoder.counters.received, frame_decoder.counters.bad, frame_decoder.counters.lost) == (100, 10, 0)
-    assert_each_says(frame_decoder.warnings(0.6), ("AliveCounter", "Motor (0x181)", "10 frames"))
-    send_all(frame_decoder, range(60, 61))
-    assert frame_decoder.warnings(0.61) == []
+    assert (frame_decoder.counters.received, frame_decoder.counters.bad, frame_decoder.counters.lost) == (120, 10, 0)
+    assert_each_says(frame_decoder.warnings(0.7), ("AliveCounter", "Motor (0x181)", "10 frames"))
+    send_all(frame_decoder, range(70, 71))
+    assert frame_decoder.warnings(0.71) == []
     assert frame_decoder.counters.lost == 2 * 10  # the repeated frames replaced new ones
 
 
