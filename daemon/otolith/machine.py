@@ -216,7 +216,7 @@ def _without_sensors(
     for item in unmeasured:
         if item.name in file.noise:
             context.fail(("noise", item.name), f"{item.name} is not measured, so it has no noise: remove this line")
-        key = "proportional_to" if item.expression else "unknown"
+        key = "proportional_to" if item.assumption is Assumption.PROPORTIONAL else "unknown"
         with context.at("signals", item.name, key):
             twin = without_sensor(twin, item)
     return twin

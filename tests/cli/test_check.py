@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from otolith.cli.commissioning.check import check_machine, describe
+import pytest
+
+from otolith.cli.commissioning.check import check_machine, describe, without_sensors
 from otolith.machine import load_machine
 from tests.conftest import OwnMachine
 
@@ -63,3 +65,17 @@ def test_silent_machine_and_missing_signal_get_their_own_remark(tmp_path: Path) 
     half = checked(machine.machine, complete=False)
     assert half["omega"].endswith(", now 0.01 rad/s")
     assert half["i"].endswith(": other signals come, so check its entry in [signals]")
+
+
+@pytest.mark.full
+def test_what_is_lost_without_two_sensors(tmp_path: Path) -> None:
+    """A resistance and an opening that only act together, and torques that have one scale."""
+    path = tmp_path / "machine.toml"
+    text = '[machine]\nname = "p"\n[twin]\nname = "pump"\n[signals]\nT_m = { unknown = "constant" }\n'
+    path.write_text(f'{text}u = {{ unknown = "constant" }}\n[parameters]\nT_c = "0.3 N*m"\n', encoding="utf-8")
+    lines = without_sensors(load_machine(path, for_replay=True))
+    impossible = {line.split()[1]: line for line in lines if line.startswith("! ")}
+    assert set(impossible) == {"k_v", "u"}
+    assert "only together with u" in impossible["k_v"]
+    (scale,) = (line for line in lines if "only their ratios" in line)
+    assert scale.startswith("T_m: as right as the given t_1, ")

@@ -152,7 +152,10 @@ def without_sensors(machine: LoadedMachine) -> list[str]:
         for row in configured.parameters
         if row.name not in after and (row.name in before or row.name not in own)
     ]
-    given, resting = [name for name in lost if name in known], [name for name in lost if name in free]
+    given, resting = (
+        [name for name in lost if name in known],
+        [name for name in lost if name in free and rows[name].identifiable],
+    )
     if given and resting:
         ratios = f"without {names} the signals have only their ratios"
         lines.append(f"{', '.join(resting)}: as right as the given {', '.join(given)}; {ratios}")
