@@ -23,6 +23,7 @@ from otolith.discovery.decision import Approval, WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
+from otolith.health.text import undecided_text
 from otolith.machine import find_twin
 from otolith.twin.components import sites, sources
 from tests.variants import often
@@ -68,6 +69,10 @@ def test_shaft_order_is_identified_while_the_speed_changes(order: float) -> None
     assert documents[-1].model == "DT''"
     suspected = next(document for document in documents if document.explanations)
     assert suspected.decision is WindowDecision.SUSPECTED
+    told = [undecided_text(document) for document in documents]
+    assert any(text.startswith(("new torque on the shaft since", "something has changed since")) for text in told)
+    assert not any("sin(" in text for text in told)
+    assert told[-1] == ""
 
 
 def test_fixed_frequency_and_coherent_phase_are_identified() -> None:

@@ -1,9 +1,13 @@
 """Report texts: values with interval and unit, findings, and the summary line of the daemon's log."""
 
+import re
+
 import pytest
 
+from otolith.discovery.hypotheses import FaultType
 from otolith.health.limits import Level
 from otolith.health.schema import (
+    AlternativeDocument,
     DriverDocument,
     EventChange,
     EventDocument,
@@ -18,14 +22,18 @@ from otolith.health.schema import (
 )
 from otolith.health.text import (
     announcements,
+    brief,
     event_text,
     finding_text,
     headline,
+    moment_text,
     summary,
+    undecided_text,
     value_cells,
     value_text,
 )
 from tests.health.test_events import report
+from tests.messages import assert_says
 
 ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
 UNKNOWN = ParameterDocument(unit="ohm", nominal=6.5, status=Status.UNESTIMATED, reason="no current")
@@ -107,6 +115,54 @@ def test_the_headline_names_the_parts_in_the_state_of_the_machine() -> None:
     health = HealthDocument(state=Level.ACT, since=74.0, parts=parts)
     assert headline(health) == "ACT since t = 74 s: winding: short circuit between turns"
     assert headline(HealthDocument(state=Level.OK, since=0.0, parts=parts)) == "OK since t = 0 s"
+
+
+def of_parts(state: Level, **reasons: str) -> HealthDocument:
+    parts = {name: PartDocument(state=state, since=74.0, reason=reason) for name, reason in reasons.items()}
+    return HealthDocument(state=state, since=74.0, parts=parts)
+
+
+def test_the_headline_gives_a_reason_once() -> None:
+    down = of_parts(Level.NO_DATA, winding="no usable data", shaft="no usable data", bus="no usable data")
+    assert headline(down).count("no usable data") == 1
+    assert "winding" not in headline(down)  # it is so everywhere
+    well = {**down.parts, "sensors": PartDocument(state=Level.OK, since=0.0)}
+    assert "winding, shaft, bus: no usable data" in headline(down.model_copy(update={"parts": well}))
+
+
+def test_the_headline_does_not_repeat_events_that_have_lines_of_their_own() -> None:
+    health = of_parts(Level.ACT, winding=EVENT.condition)
+    assert EVENT.condition in headline(health)
+    assert headline(health, events=(EVENT,)) == "ACT since t = 74 s"
+    assert "worn" in headline(of_parts(Level.ACT, winding=EVENT.condition, shaft="worn"), events=(EVENT,))
+
+
+def test_while_undecided_there_is_one_line_without_formulas() -> None:
+    formulas = "; or ".join(f"COMPONENT: shaft: 0.00{n}·sin(1·θ) N·m (33%)" for n in (1, 2, 3))
+    finding = LEAK.model_copy(
+        update={"id": "undecided", "kind": FindingKind.OPEN, "condition": "new torque on the shaft", "text": formulas,
+                "since": 74.0})  # fmt: skip
+    causes = tuple(
+        AlternativeDocument(reason=FaultType.COMPONENT, text=text, probability=0.3) for text in formulas.split("; or ")
+    )
+    document = report(3).model_copy(update={"findings": (finding,), "explanations": causes})
+    text = undecided_text(document)
+    assert_says(text, "new torque on the shaft", "since t = 74 s", "not yet known", "3 candidates")
+    assert "sin(" not in text
+    assert undecided_text(report(3)) == ""
+    unexplained = document.model_copy(update={"explanations": ()})
+    assert "candidate" not in undecided_text(unexplained)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 9])
+def test_a_brief_line_has_time_state_and_at_most_100_characters(count: int) -> None:
+    named = {f"a_rather_long_name_{index}": ESTIMATED for index in range(count)}
+    health = of_parts(Level.OK, winding="")
+    document = report(3).model_copy(update={"parameters": named, "health": health})
+    line = brief(document)
+    assert len(line) <= 100
+    assert_says(line, moment_text(document.window.end), "OK", "window 3")
+    assert line.count("Ω") + int(next(iter(re.findall(r"and (\d+) more", line)), 0)) == count
 
 
 def test_only_a_change_is_announced() -> None:

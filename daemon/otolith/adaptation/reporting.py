@@ -66,7 +66,7 @@ NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
-OPEN_CONDITION = "the data do not yet decide between the hypotheses"
+CHANGED = "something has changed"
 NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may be one that is not among them"
 NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
@@ -268,6 +268,7 @@ def _fit_and_cost(problem: Problem, result: WindowResult) -> dict[str, FitDocume
         cost=estimated.cost,
         variance_ratio=result.posterior.belief.variance_ratio,
         outcome=estimated.outcome,
+        units={output.name: output.unit for output in problem.twin.outputs},
     )
     cost = CostDocument(evaluations=estimated.evaluations, generations=estimated.generations, searched=result.searched)
     return {"fit": fit, "cost": cost}
@@ -409,18 +410,28 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
     """Return the finding of a test that is still open after ``decision``."""
     kind, subject = _kind_and_subject(decision, test)
     text = _hypotheses_text(test)
-    condition = AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION
+    condition = AMBIGUOUS_CONDITION if test.explains_window else NOT_EXPLAINED
     return FindingDocument(
         id=f"{kind}/{subject}" if subject else "undecided",
         kind=kind,
         subject=subject,
         severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
-        condition=condition if test.explains_window else NOT_EXPLAINED,
+        condition=_what_is_new(test) if kind is FindingKind.OPEN else condition,
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
         advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
     )
+
+
+def _what_is_new(test: SequentialTest) -> str:
+    """Return what all candidates of an open test agree on, in words; they may agree on nothing but a change."""
+    twin, before = test.problem.base_model, {item.key for item in test.problem.components}
+    candidates = [test.best, *(other for other, _ in test.alternatives(test.best))]
+    new = [[item for item in each.problem.components if item.key not in before] for each in candidates]
+    sites = {item.site for each in new for item in each}
+    is_agreed = all(new) and all(each.type is FaultType.COMPONENT for each in candidates) and len(sites) == 1
+    return f"new {site_of(twin, sites.pop()).meaning}" if is_agreed and test.explains_window else CHANGED
 
 
 def _share(probability: float) -> str:

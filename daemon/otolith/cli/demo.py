@@ -11,6 +11,7 @@ import shlex
 import socket
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.cli.terminal import echo_json
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import announcements, event_text, headline, summary
+from otolith.health.text import LINE, announcements, brief, event_text, headline, undecided_text
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -179,6 +180,7 @@ class Demo:
         self._history = path_in(self._folder / "history", names.site, names.name)
         self._console = Terminal(stderr=as_json)
         self._reports: list[ReportDocument] = []
+        self._undecided = ""  # As it was printed last
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def run(self, stopped: Callable[[], bool]) -> int:
@@ -257,7 +259,19 @@ class Demo:
             self._reports.append(report)
             if echo:
                 self._print_events(announcements(report))
-                self._print(summary(report))
+                self._print_plain(report)
+
+    def _print_plain(self, report: ReportDocument) -> None:
+        """Print a report in a line, and in another one what is new while its cause is not yet known: once."""
+        self._print(brief(report, _time_of_day))
+        undecided = undecided_text(report, _time_of_day)
+        if undecided and undecided != self._undecided:
+            self._print_wrapped(undecided)
+        self._undecided = undecided
+
+    def _print_wrapped(self, text: str, style: str = "") -> None:
+        for line in textwrap.wrap(text, LINE, subsequent_indent="  ", break_on_hyphens=False):
+            self._print(line, style)
 
     def _refuse_ended(self) -> None:
         for name, process in self._processes.items():
@@ -303,7 +317,8 @@ class Demo:
         events = {event.id: event for report in self._reports for event in report.events}  # each as it was last
         self._print_events(sorted(events.values(), key=lambda event: event.start))
         if (health := self._health) is not None:
-            self._print(f"state of the machine: {headline(health, local_time)}", LEVEL_STYLES[health.state])
+            state = headline(health, local_time, events.values())
+            self._print_wrapped(f"state of the machine: {state}", LEVEL_STYLES[health.state])
         for line in self._closing_lines():
             self._print(line)
         return 0 if right else 1
@@ -317,7 +332,7 @@ class Demo:
 
     def _print_events(self, events: Iterable[EventDocument]) -> None:
         for event in events:
-            self._print(event_text(event, local_time), event_style(event))
+            self._print_wrapped(event_text(event, local_time), event_style(event))
 
     @property
     def _health(self) -> HealthDocument | None:
@@ -377,6 +392,10 @@ class Demo:
                 change = f"from {values} ({after / before - 1:+.1%})"
                 error = f"largest error {max(errors):.3%} in {len(errors)} windows"
                 self._print(f"{parameter.name} went {change}; {error}")
+
+
+def _time_of_day(seconds: float) -> str:
+    return time.strftime("%T", time.localtime(seconds))
 
 
 def _refuse_busy(endpoints: Sequence[str]) -> None:

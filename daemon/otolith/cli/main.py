@@ -215,9 +215,12 @@ def replay(
 @reader_options
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
+@click.option("--details", is_flag=True, help="Also show the candidates while a cause is not yet known.")
 @click.option("--after", type=click.IntRange(0), metavar="NUMBER",
               help="With --json: begin after the report with this sequence number.")  # fmt: skip
-def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as_json: bool, after: int | None) -> int:
+def watch(
+    connect: tuple[str, ...], credentials: "Credentials", machine: str, as_json: bool, details: bool, after: int | None
+) -> int:
     """Show the live table of running daemons, over Zenoh.
 
     With --json each report is printed once and in order, also those that were
@@ -237,7 +240,8 @@ def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as
     from otolith.publishing.zenoh_config import Connection
 
     stop = StopSignal()
-    watch_reports(Connection(connect, credentials), machine, as_json=as_json, after=after, stopped=stop.received)
+    connection = Connection(connect, credentials)
+    watch_reports(connection, machine, as_json=as_json, details=details, after=after, stopped=stop.received)
     return stop.code()
 
 

@@ -20,7 +20,7 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, 
 from otolith.cli.terminal import echo
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
-from otolith.health.text import component_text, event_text, finding_text, headline, value_cells
+from otolith.health.text import component_text, event_text, finding_text, headline, undecided_text, value_cells
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
@@ -67,19 +67,20 @@ class ReplaySummary:
             return
         last = self._last
         if last.health is not None:
-            yield Text(headline(last.health), style=LEVEL_STYLES[last.health.state])
+            yield Text(headline(last.health, events=self._events.values()), style=LEVEL_STYLES[last.health.state])
+        if undecided := undecided_text(last):
+            yield Text(undecided, style="bold magenta")
         yield title(last, f", from {time_text(self._first.window.start)} to {time_text(last.window.end)}")
         yield self._parameters(last, options.max_width)
-        for name, parameter in last.parameters.items():
-            if parameter.reason:
-                yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
+        for reason in dict.fromkeys(parameter.reason for parameter in last.parameters.values() if parameter.reason):
+            names = ", ".join(name for name, parameter in last.parameters.items() if parameter.reason == reason)
+            yield Text(f"{names} in the last window: {reason}", style="yellow")
         for component in last.components:
             yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
         for event in self._events.values():
             yield Text(event_text(event), style=event_style(event))
-        for finding in last.findings:
-            if finding.kind is FindingKind.OPEN:
-                yield Text(finding_text(finding), style="magenta")
+        candidates = (finding for finding in last.findings if finding.kind is FindingKind.OPEN)
+        yield from (Text(finding_text(finding), style="magenta") for finding in candidates)
         yield from self._counts()
 
     def _parameters(self, last: ReportDocument, width: int) -> Table:

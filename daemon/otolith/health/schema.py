@@ -264,6 +264,7 @@ class FitDocument(DocumentModel):
     cost: float  # RMSE of all outputs in units of their noise
     variance_ratio: float  # Variance between windows over the variance that they state; one if they agree
     outcome: Outcome  # How the search ended
+    units: dict[str, str] = Field(default_factory=dict)  # Of the outputs
 
 
 class CostDocument(DocumentModel):

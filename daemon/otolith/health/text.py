@@ -8,7 +8,7 @@ stays English.
 
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
@@ -21,6 +21,7 @@ from otolith.health.schema import (
     EventChange,
     EventDocument,
     FindingDocument,
+    FindingKind,
     HealthDocument,
     Language,
     ParameterDocument,
@@ -34,6 +35,7 @@ UNKNOWN = "unknown"
 UNKNOWN_STATE = "UNKNOWN"
 ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
 PARTS = "; "
+LINE = 100  # characters that fit into a log beside its time; engineering choice
 MAX_SENTENCE = 500  # characters: the time of a match grows with a high power of them, and a device may write the text
 UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 """Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
@@ -194,13 +196,50 @@ def state_word(part: PartDocument) -> str:
     return UNKNOWN_STATE if part.undetermined else part.state
 
 
-def headline(health: HealthDocument, when: Callable[[float], str] = moment_text) -> str:
-    """State of the machine, since when, and which parts are in it and why."""
-    texts, parts = texts_in(health.language), health.parts.items()
-    reasons = {name: part.reason for name, part in parts if part.state is health.state and part.reason}
-    why = "; ".join(f"{texts.translated(name)}: {reason}" for name, reason in reasons.items())
+def headline(
+    health: HealthDocument, when: Callable[[float], str] = moment_text, events: Collection[EventDocument] = ()
+) -> str:
+    """State of the machine, since when, and which parts are in it and why.
+
+    Reasons that several parts share are given once, and none if lines of its own tell of each of the open ``events``.
+    """
+    texts = texts_in(health.language)
     state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
-    return state + (f": {why}" if why else "")
+    own = [name for name, part in health.parts.items() if part.state is health.state and part.reason]
+    parts: dict[str, list[str]] = {}
+    for name in own:
+        parts.setdefault(health.parts[name].reason, []).append(texts.translated(name))
+    if not parts or {event.condition for event in events} >= parts.keys():
+        return state
+    if len(parts) == 1 and len(own) == len(health.parts):
+        return f"{state}: {next(iter(parts))}"
+    why = (f"{', '.join(names)}: {reason}" for reason, names in parts.items())
+    return f"{state}: {'; '.join(why)}"
+
+
+def undecided_text(document: ReportDocument, when: Callable[[float], str] = moment_text) -> str:
+    """What is new, since when, and how many causes are possible, while it is open which one holds; else empty."""
+    texts = texts_in(document.health.language) if document.health else texts_in("en")
+    finding = next((item for item in document.findings if item.kind is FindingKind.OPEN), None)
+    if finding is None:
+        return ""
+    count, since = len(document.explanations), texts("since", time=when(finding.since))
+    causes = texts("candidates", count=count) if count > 1 else ""
+    return texts("undecided", what=finding.condition, since=since, causes=causes)
+
+
+def brief(document: ReportDocument, when: Callable[[float], str] = moment_text, width: int = LINE) -> str:
+    """A report in one line of at most ``width`` characters: time, state, and the parameters that have room."""
+    state = "" if document.health is None else f" {state_word(document.health)}"
+    line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
+    texts = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
+    for index, text in enumerate(texts):
+        left = len(texts) - index - 1
+        rest = f", and {left} more" if left else ""
+        if len(f"{line}, {text}{rest}") > width:
+            return f"{line}, and {left + 1} more"
+        line += f", {text}"
+    return line
 
 
 def summary(document: ReportDocument) -> str:

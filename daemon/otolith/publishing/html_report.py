@@ -145,12 +145,14 @@ def html_report(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_shown
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
-    own = {"when": _time_of_day if is_of_calendar(axis.begin) else text.moment_text, "words": say.translated}
+    own_when = _time_of_day if is_of_calendar(axis.begin) else text.moment_text
+    own = {"when": own_when, "words": say.translated}
     environment.filters |= vars(text) | own | {"whole": whole, "quantity_text": quantity_text}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
     is_over = latest is not None and now <= latest.window.end
     return template.render(
+        own_when=own_when,
         say=say, machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
         zone=zone, lanes=list(_lanes(axis, latest, states)), curves=curves, is_over=is_over,

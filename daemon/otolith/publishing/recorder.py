@@ -34,6 +34,7 @@ from otolith.health.text import (
     probability_text,
     state_word,
     texts_in,
+    undecided_text,
     value_text,
 )
 from otolith.machine import RecordedMachine
@@ -399,6 +400,7 @@ def operator_text(document: ReportDocument) -> str:
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
         lines += [] if current else [_plain(health.reason or texts("all_well"))]
+    lines += [_plain(undecided)] if (undecided := undecided_text(document)) else []
     lines += [_paragraph(event, health.state) for event in current]
     judged = {event.id.partition("@")[0].partition("/")[2] for event in current}
     for name, item in document.parameters.items():
@@ -427,7 +429,8 @@ def report_text(document: ReportDocument) -> str:
     """Return the report as tables in Markdown."""
     texts = texts_in("en" if document.health is None else document.health.language)
     rows = [f"# {document.machine}, {document.site}", ""]
-    rows += [] if document.health is None else [headline(document.health), ""]
+    current = [event for event in document.events if event.end is None]
+    rows += [] if document.health is None else [headline(document.health, events=current), ""]
     say, columns = texts.translated, "| {} | {} | {} |\n|---|---|---|"
     rows += [columns.format(say("parameter"), say("value"), say("status"))]
     parameters = document.parameters.items()
@@ -438,7 +441,7 @@ def report_text(document: ReportDocument) -> str:
             f"| {say(row.meaning)} | {equation_text(row.equation)} | {say(row.status)} {say(row.approval)} |"
             for row in document.components
         ]
-    rows += [f"\n{event_text(event)}" for event in document.events if event.end is None]
+    rows += [f"\n{event_text(event)}" for event in current]
     return "\n".join(rows)
 
 

@@ -31,11 +31,12 @@ from otolith.health.text import (
     probability_text,
     state_word,
     texts_in,
+    undecided_text,
     value_cells,
     value_text,
 )
 from otolith_drivers.grammars.json_lines import checked_line
-from otolith_drivers.units import equation_text
+from otolith_drivers.units import equation_text, quantity_text
 
 if TYPE_CHECKING:
     from otolith.publishing.subscriber import Subscriber
@@ -71,24 +72,31 @@ class _Machine:
     received: float  # Monotonic s
     histories: dict[str, deque[float]] = field(default_factory=dict)
 
-    def draw(self, state: str, width: int, *, in_short: bool) -> list[RenderableType]:
-        """Return its lines and tables; ``in_short`` without components, messages and counters."""
+    def draw(self, state: str, width: int, *, in_short: bool, details: bool) -> list[RenderableType]:
+        """Return its lines and tables; ``in_short`` without components, messages and counters.
+
+        With ``details`` as the specialist reads it: also the candidates while it is open which cause holds.
+        """
         document, silence = self.document, time.monotonic() - self.received
         texts = texts_of(document)
         head = [title(document)] if in_short else []
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
             silent = texts("silent", time=local_time(document.window.end), duration=duration_text(silence))
-            return [*head, Text(f"{silent}: {state}", style="bold red"), _Grey(Group(*self._parts(width, in_short)))]
-        return [*head, *self._parts(width, in_short)]
+            return [
+                *head,
+                Text(f"{silent}: {state}", style="bold red"),
+                _Grey(Group(*self._parts(width, in_short, details))),
+            ]
+        return [*head, *self._parts(width, in_short, details)]
 
-    def _parts(self, width: int, in_short: bool) -> list[RenderableType]:
+    def _parts(self, width: int, in_short: bool, details: bool) -> list[RenderableType]:
         document, texts = self.document, texts_of(self.document)
         table = _parameters(document.parameters, self.histories, width, texts)
         if in_short:
             return [*state_lines(document), table, Text()]
         parts: list[RenderableType] = [*state_lines(document), *_title_lines(document, texts), table]
         parts += [_components(document, width, texts)] if document.components else []
-        return [*parts, *_messages(document, texts), *_counters(document, texts)]
+        return [*parts, *_messages(document, texts, details=details), *_counters(document, texts)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +113,8 @@ class _Grey:
 class LiveTable:
     """Takes reports from any thread, and draws itself; ``state`` returns what is waited for, in words."""
 
-    def __init__(self, state: Callable[[], str]) -> None:
-        self._state = state
+    def __init__(self, state: Callable[[], str], *, details: bool = False) -> None:
+        self._state, self._details = state, details
         self._lock = threading.Lock()
         self._machines: dict[tuple[str, str], _Machine] = {}
         self._unreadable = 0
@@ -138,7 +146,11 @@ class LiveTable:
         with self._lock:
             in_short = len(self._machines) > 1
             shown = [self._machines[key] for key in sorted(self._machines)]
-            parts = [part for machine in shown for part in machine.draw(state, width, in_short=in_short)]
+            parts = [
+                part
+                for machine in shown
+                for part in machine.draw(state, width, in_short=in_short, details=self._details)
+            ]
             unreadable = self._unreadable
         if in_short:
             parts.append(Text("'--machine NAME' shows more of one machine", style="dim"))
@@ -172,9 +184,12 @@ def state_lines(document: ReportDocument) -> list[Text]:
     for name, part in health.parts.items():
         parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
-    lines = [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts]
+    told = current if len(current) > 1 else ()
+    lines = [Text(headline(health, local_time, told), style=LEVEL_STYLES[health.state]), parts]
+    if undecided := undecided_text(document, local_time):
+        lines.append(Text(undecided, style="bold magenta"))
     for event in current:
-        if len(current) > 1 or event.state is not health.state:  # otherwise the first line has said so
+        if told or event.state is not health.state:  # otherwise the first line has said so
             what, since = f"{say(event.state)}: {say(event.part)}: {event.condition}", local_time(event.since)
             lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
@@ -206,10 +221,9 @@ def _title_lines(document: ReportDocument, texts: Texts) -> list[Text]:
     window, quality = document.window, document.window.quality
     line = Text(f"{texts('window')} {window.index} ")
     line.append(texts.translated(quality.verdict), style="green" if quality.verdict is Verdict.GOOD else "red")
-    numbers = {"missing": f"{quality.missing:.1%}", "jitter": f"{quality.jitter_s * 1e3:.1f}"}
-    line.append(f", {texts('sampling', records=window.records, **numbers)}")
+    line.append(f", {texts('sampling', records=window.records, jitter=f'{quality.jitter_s * 1e3:.1f}')}")
     if document.fit is not None and document.cost.seconds is not None:
-        line.append(f", {document.cost.seconds * 1e3:.0f} ms")
+        line.append(f", {texts('computed', milliseconds=f'{document.cost.seconds * 1e3:.0f}')}")
     return [title(document), line]
 
 
@@ -252,24 +266,31 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
     return Group(*lines) if width < WIDTH_WITH_COMPONENTS else table
 
 
-def _messages(document: ReportDocument, texts: Texts) -> list[Text]:
-    """Reasons, advice, open tests, and how well the twin explains the window."""
+def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[Text]:
+    """Reasons, advice, and how well the twin explains the window.
+
+    While it is open which cause holds, reasons and advice are about the candidates: they are details.
+    """
     bad = document.window.quality.reasons
     lines = [Text(f"{texts('bad_window')}: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
         if expected := forecast_text(parameter, document.window.end, texts.language):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
+    candidates = [finding for finding in document.findings if finding.kind is FindingKind.OPEN]
+    if candidates and not details:
+        return lines
     for key, style in (("reason", "yellow"), ("advice", "cyan"))[bool(bad) :]:
         names: dict[str, list[str]] = {}
         for name, parameter in document.parameters.items():
             names.setdefault(getattr(parameter, key) or "", []).append(name)
         lines += [Text(f"{', '.join(own)}: {text}", style=style) for text, own in names.items() if text]
-    for finding in (finding for finding in document.findings if finding.kind is FindingKind.OPEN):
+    for finding in candidates:
         lines.append(Text(f"{texts('open_test')}: {finding.text}", style="magenta"))
         if finding.advice:
             lines.append(Text(f"  {finding.advice}", style="cyan"))
     if document.fit is not None:
-        errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
+        units, rows = document.fit.units, document.fit.rmse_estimated.items()
+        errors = ", ".join(f"{name} {quantity_text(value, units.get(name, '1'), digits=3)}" for name, value in rows)
         explained = texts("explained" if document.fit.explained else "unexplained")
         lines.append(Text(f"{texts('residual', errors=errors)}: {explained}"))
     return lines
@@ -313,11 +334,18 @@ def sparkline(values: tuple[float, ...], scale: tuple[float, float] | None = Non
 
 
 def watch_reports(
-    connection: "Connection", machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
+    connection: "Connection",
+    machine: str,
+    *,
+    as_json: bool,
+    details: bool,
+    after: int | None,
+    stopped: Callable[[], bool],
 ) -> None:
     """Show reports until ``stopped``; wait for a daemon that is not there yet.
 
-    As JSON each report is printed once and in order, beginning after the sequence number ``after``.
+    ``details`` are for the specialist. As JSON each report is printed once and in order, beginning after the sequence
+    number ``after``.
     """
     from otolith.publishing.subscriber import Subscriber
 
@@ -337,7 +365,7 @@ def watch_reports(
             if as_json:
                 _stream(texts, subscriber, stopped)
                 return
-            table = LiveTable(subscriber.state)
+            table = LiveTable(subscriber.state, details=details)
             with Live(table, console=Terminal(), refresh_per_second=5):
                 while not stopped():
                     for text in drain(texts, PAUSE):
