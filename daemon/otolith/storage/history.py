@@ -13,14 +13,24 @@ import math
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
+
+from pydantic import BaseModel, Field
 
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.labels import TimeLabels
 from otolith.health.limits import Level
-from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, PartDocument, ReportDocument
+from otolith.health.schema import (
+    EventDocument,
+    FindingDocument,
+    NumberDocument,
+    ParameterDocument,
+    PartDocument,
+    ReportDocument,
+)
+from otolith.storage.history_safety import QUERY_TIME, Unpacker, bound, moment, number, rows_of
 from otolith.storage.history_schema import check, upgrade
 from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError
@@ -106,6 +116,17 @@ def describe_machine(twin: Definition, plan: MonitoringPlan, log: Mapping[str, A
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
     return json.dumps({**texts, "values": values, "limits": limits, "sites": sites}, ensure_ascii=False)
+
+
+class _Description(BaseModel):
+    """What :func:`describe_machine` writes; other versions may write less, or more."""
+
+    title: str = ""
+    equations: tuple[tuple[str, str], ...] = ()
+    values: dict[str, tuple[float | None, str, str]] = Field(default_factory=dict)
+    limits: dict[str, tuple[tuple[Level, float, bool], ...]] = Field(default_factory=dict)
+    sites: dict[str, tuple[str, str, str]] = Field(default_factory=dict)
+    log: dict[str, tuple[str, ...]] | None = None
 
 
 class Tables:
@@ -203,10 +224,6 @@ class Tables:
         return self._series[key]
 
 
-def _unpacked(text: bytes | str) -> str:
-    return zlib.decompress(text).decode() if isinstance(text, bytes) else text
-
-
 class HistoryReader:
     """Reads the history of a machine, also while a daemon writes; each call opens the database for itself."""
 
@@ -241,13 +258,23 @@ class HistoryReader:
             f"WHERE resolution = ? AND time >= ? {chosen} ORDER BY time, series.id"
         )
         labels = self.labels()
-        samples = (HistorySample(*row) for row in self._rows(query, resolution, labels.first(since), *names))
-        return [replace(sample, time=labels.unix(sample.time)) for sample in samples] if labels.spans else [*samples]
+        rows = self._rows(query, resolution, labels.first(since), *names)
+
+        def parse(name: str, unit: str, time: float, count: int, *rest: Any) -> HistorySample:
+            *values, low, high, status = rest
+            least, mean, most, last = map(number, values)
+            low, high = (None if end is None else number(end) for end in (low, high))
+            unix = labels.unix(moment(time))
+            return HistorySample(
+                str(name), str(unit), unix, int(count), least, mean, most, last, low, high, str(status)
+            )
+
+        return self._undamaged(rows, parse)
 
     def first(self, resolution: int) -> float | None:
         """Return the time of the oldest value of a resolution; None if there is none."""
         ((time,),) = self._rows("SELECT min(time) FROM sample WHERE resolution = ?", resolution)
-        return None if time is None else self.labels().unix(time)
+        return None if time is None else self.labels().unix(self._moment(time))
 
     def events(self, since: float) -> list[EventDocument]:
         """Return the changes of events since a time, in the order in which they were published."""
@@ -258,7 +285,8 @@ class HistoryReader:
     def event_ends(self, since: float) -> dict[int, float]:
         """Return the end (service time) of the window of each change of an event since a time, by sequence number."""
         query = f"SELECT sequence, time FROM event {_SINCE}"  # noqa: S608 - our own text
-        return dict(self._rows(query, self.labels().first(since)))
+        rows = self._rows(query, self.labels().first(since))
+        return dict(self._undamaged(rows, lambda sequence, time: (int(sequence), moment(time))))
 
     def last_changes(self) -> dict[str, EventDocument]:
         """Return the last change of each event by its id (service times, of ``LATEST_CHANGES``), the latest first."""
@@ -275,9 +303,11 @@ class HistoryReader:
         rows = self._rows(query, labels.first(since))
 
         def parse(first: float, last: float, count: int, text: str) -> dict[str, Any]:
-            document = {**json.loads(text)}
+            FindingDocument.model_validate_json(text)
+            document = json.loads(text)
             times = {"first": first, "last": last, "since": document.get("since", first)}
-            return {**document, "count": count, **{name: labels.unix(time) for name, time in times.items()}}
+            times = {name: labels.unix(moment(time)) for name, time in times.items()}
+            return {**document, "count": int(count), **times}
 
         return self._undamaged(rows, parse)
 
@@ -286,7 +316,8 @@ class HistoryReader:
         labels, query = self.labels(), "SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour"
         rows = self._rows(query, labels.first(since) - HOUR)
         return self._undamaged(
-            rows, lambda hour, run, text: {"hour": labels.unix(hour), "run": run, **json.loads(text)}
+            rows,
+            lambda hour, run, text: {**json.loads(text), "hour": labels.unix(moment(hour)), "run": int(moment(run))},
         )
 
     def states(self, since: float) -> list[PartState]:
@@ -299,30 +330,38 @@ class HistoryReader:
         labels = self.labels()
 
         def parse(part: str, entered: float, since: float, state: str) -> PartState:
-            return PartState(part, labels.unix(entered), labels.unix(since), Level(state))
+            return PartState(str(part), labels.unix(moment(entered)), labels.unix(moment(since)), Level(state))
 
         return self._undamaged(self._rows(query, labels.first(since)), parse)
 
     def description(self) -> dict[str, Any]:
         """Return what :func:`describe_machine` wrote; empty if nobody did."""
-        rows = self._rows("SELECT text FROM description")
-        return next(iter(self._undamaged(rows, lambda text: dict(json.loads(text)))), {})
+        rows = self._rows("SELECT text FROM description LIMIT 1")
+
+        def parse(text: str) -> dict[str, Any]:
+            _Description.model_validate_json(text)
+            return dict(json.loads(text))
+
+        return next(iter(self._undamaged(rows, parse)), {})
 
     def labels(self) -> TimeLabels:
         """Return the Unix times of service times, as they are known now."""
         rows = self._rows("SELECT begin, ahead FROM label ORDER BY begin")
-        return TimeLabels(tuple((begin, ahead) for begin, ahead in rows))
+        labels = TimeLabels(tuple(self._undamaged(rows, lambda begin, ahead: (moment(begin), moment(ahead)))))
+        if not labels.is_plausible:
+            raise ConfigurationError(f"{self.path}: cannot be read: the labels of its times are not plausible")
+        return labels
 
     def last(self) -> float:
         """Return the service time at which the window of the newest report ends; minus infinity if there is none."""
         rows = self._rows("SELECT time FROM report ORDER BY sequence DESC LIMIT 1")
-        return float(rows[0][0]) if rows else -math.inf
+        return self._moment(rows[0][0]) if rows else -math.inf
 
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""
         rows = self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", count)
-        labels = self.labels()
-        reports = self._undamaged(rows, lambda text: labels.of_report(ReportDocument.from_json(_unpacked(text))))
+        labels, unpacked = self.labels(), Unpacker()
+        reports = self._undamaged(rows, lambda text: labels.of_report(ReportDocument.from_json(unpacked(text))))
         if rows and not reports:
             raise ConfigurationError(f"{self.path}: cannot be read: the disk has damaged the last {len(rows)} reports")
         return reports
@@ -339,12 +378,12 @@ class HistoryReader:
             "WHERE sequence > ?1 AND (?2 IS NULL OR time >= ?2) AND (?3 IS NULL OR time <= ?3) "
             "ORDER BY sequence LIMIT ?4"
         )
-        labels = self.labels()
+        labels, unpacked = self.labels(), Unpacker()
         begin, until = start and labels.first(start), end and labels.last(end)
         rows = self._rows(query, after, begin, until, limit)
 
         def published(row: bytes | str) -> str:
-            text = _unpacked(row)
+            text = unpacked(row)
             if not labels.spans:
                 return text
             if kind == "event":
@@ -359,7 +398,7 @@ class HistoryReader:
         for row in rows:
             try:
                 contents.append(parse(*row))
-            except (zlib.error, ValueError, TypeError):
+            except (zlib.error, ValueError, TypeError, LookupError, RecursionError):
                 damaged += 1
         if damaged:
             log.warning("%s: %d rows that the disk has damaged are left out", self.path, damaged)
@@ -369,7 +408,13 @@ class HistoryReader:
         with self._checked() as (connection, identity):
             if identity != (self.site, self.machine):
                 raise ValueError(f"it is of {identity[1]} at {identity[0]}")
-            return connection.execute(query, values).fetchall()
+            return rows_of(connection.execute(query, values))
+
+    def _moment(self, value: object) -> float:
+        try:
+            return moment(value)
+        except ValueError as error:
+            raise ConfigurationError(f"{self.path}: cannot be read: it has the time {value!r:.40}") from error
 
     @contextlib.contextmanager
     def _checked(self) -> Iterator[tuple[sqlite3.Connection, tuple[str, str]]]:
@@ -378,11 +423,14 @@ class HistoryReader:
             raise ConfigurationError(f"{self.path}: no such file; 'otolith run' makes the history of a machine")
         try:
             with self._opened() as connection:
+                bound(connection)
                 identity = check(connection)
                 upgrade(connection, "temp")
                 yield connection, identity
         except (sqlite3.Error, ValueError) as error:
-            raise ConfigurationError(f"{self.path}: cannot be read: {error}") from error
+            is_slow = isinstance(error, sqlite3.OperationalError) and str(error) == "interrupted"
+            reason = f"a query takes longer than {QUERY_TIME:g} s" if is_slow else str(error)
+            raise ConfigurationError(f"{self.path}: cannot be read: {reason}") from error
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:

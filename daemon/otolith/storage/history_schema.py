@@ -6,6 +6,8 @@ import sqlite3
 from collections.abc import Callable
 from typing import Literal
 
+from otolith.storage.history_safety import check_tables
+
 SCHEMA_VERSION = 3
 APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
 PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
@@ -70,6 +72,7 @@ def check(connection: sqlite3.Connection) -> tuple[str, str]:
         raise NewerVersionError(f"{newer}: install the newer Otolith again, or move the file away")
     if version < 1:
         raise ValueError(f"version {version} of the format: this Otolith reads 1 to {SCHEMA_VERSION}")
+    check_tables(connection)
     rows = connection.execute("SELECT site, machine FROM identity LIMIT 2").fetchall()
     if len(rows) != 1 or not all(isinstance(name, str) for name in rows[0]):
         raise ValueError("it is not of one machine")

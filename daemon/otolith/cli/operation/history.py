@@ -369,8 +369,8 @@ def page_of(reader: "HistoryReader", since: float, end: float) -> bytes:
     interval = interval_since(reader, since, end)
     try:
         page = html_report(reader, samples_since(reader, interval, since, ()), interval, since, end)
-    except ValueError as error:
-        raise ConfigurationError(f"{reader.path}: cannot be read: {error}") from error
+    except FORGED as error:
+        raise ConfigurationError(f"{reader.path}: cannot be read: {type(error).__name__}: {error}") from error
     return page.encode()
 
 
