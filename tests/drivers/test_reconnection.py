@@ -44,7 +44,7 @@ def test_each_change_is_logged_once_and_each_return_counted(caplog: pytest.LogCa
             connection.go_down("no answer")
         assert (connection.up, connection.reason) == (False, "no answer")
     assert connection.count == 1
-    assert_each_says(caplog.messages, *[("line", "answers"), ("line", "no answer", "retried")] * 2)
+    assert_each_says(caplog.messages, *[("line", "answers"), ("line", "no answer", "again")] * 2)
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,9 @@ from otolith_drivers.units import equation_text
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
+SUSPECTED = (
+    "this window differs from the prediction: it may be a sudden change or an outlier, and the next windows decide"
+)
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
@@ -224,7 +227,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     decision, test = result.decision, result.test
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
-        reasons.append(decision.value)
+        reasons.append(SUSPECTED if decision is WindowDecision.SUSPECTED else decision.value)
     if test is not None and result.is_mixture:
         reasons.append(_hypotheses_text(test))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:

@@ -28,7 +28,7 @@ MIN_DISTANCE = 2.0 * DECISIVE  # χ² between two predictions that decides with 
 SUBSTEPS = 4
 REGULARISATION = 1e-12
 OTHER_INPUTS = " if the other inputs stay as they are"
-NO_EXPERIMENT = "no change of one input distinguishes them: inspect the sensors and the machine"
+NO_EXPERIMENT = "no change of a single input can tell these causes apart: inspect the sensors and the machine"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,7 @@ from functools import lru_cache
 from importlib.resources import files
 
 from otolith.acquisition.quality import time_text
+from otolith.discovery.decision import Approval
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import (
     ComponentDocument,
@@ -120,7 +121,13 @@ def parameter_text(name: str, parameter: ParameterDocument) -> str:
 
 def component_text(component: ComponentDocument) -> str:
     """Site, equation and approval of a component that the twin lacks."""
-    return f"{component.meaning}: {equation_text(component.equation)} ({component.approval})"
+    return f"{component.meaning}: {equation_text(component.equation)} ({approval_text(component, texts_in('en'))})"
+
+
+def approval_text(component: ComponentDocument, texts: Texts) -> str:
+    """What the operator decided about a component."""
+    is_open = component.approval is Approval.OPEN
+    return texts("not_approved") if is_open else texts.translated(component.approval)
 
 
 def finding_text(finding: FindingDocument) -> str:

@@ -27,6 +27,7 @@ from otolith.health.schema import EventDocument, Report, ReportDocument, Status
 from otolith.health.text import (
     Texts,
     announcements,
+    approval_text,
     event_text,
     forecast_text,
     headline,
@@ -438,7 +439,7 @@ def report_text(document: ReportDocument) -> str:
     if document.components:
         rows += ["", columns.format(say("component"), say("equation"), say("status"))]
         rows += [
-            f"| {say(row.meaning)} | {equation_text(row.equation)} | {say(row.status)} {say(row.approval)} |"
+            f"| {say(row.meaning)} | {equation_text(row.equation)} | {say(row.status)}, {approval_text(row, texts)} |"
             for row in document.components
         ]
     rows += [f"\n{event_text(event)}" for event in current]

@@ -151,7 +151,7 @@ class Subscriber:
         addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
         if self.connected:
             reports = REPORT.under("*", self._machine)
-            return f"connected, no report yet; if none comes, {reports} goes to other readers only ({addresses})"
+            return f"connected, no report yet; if none comes, this reader may not read {reports} ({addresses})"
         if addresses:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
         own = "no daemon of this user runs here, and no service whose reports it may read (the group otolith may)"

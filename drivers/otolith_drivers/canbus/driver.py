@@ -203,7 +203,7 @@ class CanReceiver(ThreadedDriver):
                 failure = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
             else:
                 if (cause := bus_error(bus)) is None:
-                    self._connection.come_up("is open again")
+                    self._connection.come_up("the interface is open again, waiting for frames")
                     return bus
                 _shut(bus)
                 failure = f"CAN bus {self._options.title()}: {cause}"

@@ -73,7 +73,7 @@ class Reconnection:
         """Note why the connection is down."""
         if reason != self._logged:
             self._logged = reason
-            self._log.warning("%s: %s; retried until it answers", self._title, reason)
+            self._log.warning("%s: %s; trying again until it works", self._title, reason)
         if self.up and time.monotonic() - self._begun >= LASTING:
             self.backoff.reset()
         self.state = False, reason

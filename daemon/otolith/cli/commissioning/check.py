@@ -23,7 +23,7 @@ from otolith_drivers.user_dirs import check_writable
 LISTEN = 1.0  # s; the shortest time to listen,
 MIN_PERIODS = 60  # or so many sample periods if that is longer: a drive polled at 1 Hz needs a minute
 PATIENCE = 4.0  # s to wait for missing signals until the driver gives the cause, such as a refused connection
-MIN_SHARE = 0.5  # of the samples expected at the sample period; below it "too few" is printed
+MIN_SHARE = 0.5  # of the samples expected at the sample period; below it the expected number is printed
 PAUSE = 0.1  # s between two looks at the driver
 PROBED = ("can", "modbus")  # drivers that have an 'otolith probe'
 NO_LIMITS = "none, so no change of it is an event: write {} = {{ watch = {} }} under [parameters]"
@@ -236,7 +236,11 @@ def _causes(link: Link) -> list[str]:
 
 def _remark(count: int, expected: float, *, any_came: bool) -> str:
     if count:
-        return "" if count >= MIN_SHARE * expected else ", too few"
+        return (
+            ""
+            if count >= MIN_SHARE * expected
+            else f"; {expected:.0f} were expected: check the cycle time in the device"
+        )
     if any_came:
         return ": other signals come, so check its entry in [signals]"
     return ": is the machine on?"

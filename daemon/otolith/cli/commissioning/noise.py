@@ -158,7 +158,7 @@ def _input_row(
         return line, f"± {shown.level_sd / shown.level:.1%}"
     states = driven_states(machine.twin, source.name)
     contain = f"process noise of {' and '.join(states)}" if states else "noise of the outputs"
-    acts = f"its noise acts like {contain}, which contains what is not stated here"
+    acts = f"it cannot be told from {contain}: the level there includes it"
     if shown is None:
         return line, f"not identifiable: {acts}"
     return line, f"not significant: up to about {shown.limit:.1g} {source.unit} cannot be detected; {acts}"
@@ -176,7 +176,7 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
                 bands = (f"{band.ratio:.2g} to {band.high:.3g} Hz" for band in row.bands)
                 yield f"#   power over that of white noise, from {row.bands[0].low:.3g} Hz: {', '.join(bands)}"
     if inflated and not all(row.is_white for row in identified.whiteness):
-        yield "# process noise contains what the twin lacks, and may bias parameters: a replay without it names causes"
+        yield "# process noise hides what the twin lacks, and may bias parameters: a replay without it names the causes"
 
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:

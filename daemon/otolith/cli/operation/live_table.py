@@ -24,6 +24,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
 from otolith.health.text import (
     Texts,
+    approval_text,
     duration_text,
     forecast_text,
     headline,
@@ -259,7 +260,7 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
     for component in document.components:
         amplitude = component.values["amplitude"]
         text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-        status = f"{say(component.status)}, {say(component.approval)}"
+        status = f"{say(component.status)}, {approval_text(component, texts)}"
         cells = say(component.meaning), equation_text(component.equation), text, local_time(component.onset), status
         table.add_row(*cells)
         lines.append(Text("{}: {}: {}, {}, {}".format(*cells)))
