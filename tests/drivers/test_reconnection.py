@@ -2,21 +2,28 @@
 
 import errno
 import logging
+import re
 import socket
 import ssl
-import time
 
 import pytest
 
-from otolith_drivers.common.reconnection import BACKOFF_FIRST, BACKOFF_MAX, LASTING, Reconnection, cause_of
+from otolith_drivers.common.reconnection import (
+    BACKOFF_FIRST,
+    BACKOFF_MAX,
+    LASTING,
+    LINE_PERIOD,
+    LINES,
+    Reconnection,
+    cause_of,
+)
 from tests.messages import assert_each_says
 
 
-def test_a_pause_grows_until_the_connection_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pause_grows_until_the_connection_lasts() -> None:
     """A broker may accept a client and close its connection at once, for ever."""
     now = 0.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
-    connection = Reconnection("line", logging.getLogger("test"))
+    connection = Reconnection("line", logging.getLogger("test"), lambda: now)
     pauses = []
     for _ in range(10):
         pauses.append(connection.backoff.next())
@@ -45,6 +52,29 @@ def test_each_change_is_logged_once_and_each_return_counted(caplog: pytest.LogCa
         assert (connection.up, connection.reason) == (False, "no answer")
     assert connection.count == 1
     assert_each_says(caplog.messages, *[("line", "answers"), ("line", "no answer", "again")] * 2)
+
+
+def test_a_connection_that_fails_once_a_minute_for_a_day_has_few_lines_in_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    now = 0.0
+    connection = Reconnection("line", logging.getLogger("test"), lambda: now)
+    for _ in range(1440):
+        connection.come_up("answers")
+        now += 55.0
+        for reason in ("the connection was closed", "Connection refused"):
+            now += 2.5
+            connection.go_down(reason)
+    assert connection.count == 1439
+    assert len(caplog.messages) <= LINES + 86400 / LINE_PERIOD
+    left_out = [int(found[1]) for line in caplog.messages if (found := re.search(r"\((\d+) lines", line))]
+    assert 0.95 * 3 * 1440 < len(caplog.messages) + sum(left_out) <= 3 * 1440 + len(left_out)
+    caplog.clear()
+    for _ in range(int(LINE_PERIOD)):  # it stays down: the log says so in the end
+        now += 1.5
+        connection.go_down("no answer")
+    assert_each_says(caplog.messages, ("line", "no answer", "lines"))
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,12 @@ from typing import Any
 
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 LASTING = 1.0  # s; a connection that lasted so long works, and the next pause is the shortest one again
+LINES, LINE_PERIOD = 12, 300.0  # lines about a connection in the log at once; s for each further one
 FAULT_SHOWN = 10.0  # s after which a passing fault is no longer a warning
 CLOSE_TIMEOUT = 0.9  # s for the thread to end
 MAX_KINDS = 20  # kinds of exceptions of a driver that are logged
+
+Clock = Callable[[], float]  # s, of a clock that advances steadily
 
 
 class ReconnectBackoff:
@@ -35,11 +38,34 @@ class ReconnectBackoff:
         return pause * random.uniform(0.5, 1.0)  # noqa: S311 - jitter, not a secret
 
 
-class Reconnection:
-    """Whether a connection is up, why it is down, and how often it came back. Each change is logged once."""
+class _LineLimit:
+    """How many lines about a connection the log may have: ``LINES`` at once, then one each ``LINE_PERIOD``."""
 
-    def __init__(self, title: str, log: logging.Logger) -> None:
-        """``title`` begins each line of the log."""
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._time, self._left = clock, clock(), float(LINES)
+        self._left_out = 0
+
+    def remark(self) -> str | None:
+        """Return what the next line ends with: how many were left out; None if it must be left out, too."""
+        now = self._clock()
+        self._left, self._time = min(LINES, self._left + (now - self._time) / LINE_PERIOD), now
+        if self._left < 1.0:
+            self._left_out += 1
+            return None
+        self._left -= 1.0
+        left_out, self._left_out = self._left_out, 0
+        return f" ({left_out} lines about it were left out before this one)" if left_out else ""
+
+
+class Reconnection:
+    """Whether a connection is up, why it is down, and how often it came back. Each change is logged once.
+
+    Of a connection that fails and returns again and again, not every change is logged.
+    """
+
+    def __init__(self, title: str, log: logging.Logger, clock: Clock = time.monotonic) -> None:
+        """``title`` begins each line of the log; ``clock`` gives the time in s."""
+        self._clock, self._limit = clock, _LineLimit(clock)
         self.state, self.count = (False, "not opened yet"), 0  # Up or not, and why not: both change at once
         self.backoff = ReconnectBackoff()
         self._title, self._log = title, log
@@ -66,15 +92,16 @@ class Reconnection:
             self.state, self._logged = (True, ""), ""
             self.count += self._was_up
             self._was_up = True
-            self._begun = time.monotonic()
-            self._log.info("%s: %s", self._title, what)
+            self._begun = self._clock()
+            if (remark := self._limit.remark()) is not None:
+                self._log.info("%s: %s%s", self._title, what, remark)
 
     def go_down(self, reason: str) -> None:
         """Note why the connection is down."""
-        if reason != self._logged:
-            self._logged = reason
-            self._log.warning("%s: %s; trying again until it works", self._title, reason)
-        if self.up and time.monotonic() - self._begun >= LASTING:
+        if reason != self._logged and (remark := self._limit.remark()) is not None:
+            self._logged = reason  # one that is left out is tried again with the next attempt
+            self._log.warning("%s: %s; trying again until it works%s", self._title, reason, remark)
+        if self.up and self._clock() - self._begun >= LASTING:
             self.backoff.reset()
         self.state = False, reason
 
