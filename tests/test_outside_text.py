@@ -8,11 +8,16 @@ import io
 import json
 import logging
 import re
+import socket
+import tempfile
 import tomllib
 from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
@@ -24,15 +29,26 @@ from rich.text import Text
 from otolith.cli.commissioning.probe import _opcua_line
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LiveTable
+from otolith.cli.operation.unit_file import comment, directive
 from otolith.cli.terminal import JournalFormatter, LogFormatter, echo, echo_csv, echo_json
-from otolith.health.schema import DriverDocument, EventChange, ReportDocument
+from otolith.health.schema import DriverDocument, EventChange, EventDocument, ReportDocument
+from otolith.machine_file import MachineTable
+from otolith.publishing.html_report import html_report
+from otolith.publishing.recorder import LOG, _columns, operator_text, report_text
+from otolith.publishing.zenoh_session import prefix
+from otolith.runtime.process import EventCommand
+from otolith.runtime.service import Notifier
 from otolith.storage.evidence import public_text
-from otolith_drivers.grammars.json_lines import checked_line
+from otolith.storage.history import WINDOW, path_in
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.grammars.json_lines import checked_line, json_text
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 from otolith_drivers.opcua.connection import Variable
 from otolith_drivers.outside_text import CONTROL
 from tests.hostile import HOSTILE, hostile_text
-from tests.storage.histories import document
+from tests.publishing.test_html_report import written
+from tests.storage.histories import START, document
+from tests.waiting import wait_for
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[lh]|\x1b\[\d*[AK]")
 """The escape sequences of our own: colours, and those that draw a table again in its place."""
@@ -222,7 +238,148 @@ def is_a_cell(_: str, written: str) -> None:
 
 TABLES = {"CSV": Writer(lambda text: printed(lambda: echo_csv([[text, -1.5]])), is_a_cell)}
 
+
+class Tags(HTMLParser):
+    """The tags of a page, with the names of their attributes."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: set[tuple[str, ...]] = set()
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.found.add((tag, *sorted(name for name, _ in attributes)))
+
+
+def is_a_page(text: str, written: str) -> None:
+    assert_lines(written)
+    assert Tags(written).found <= Tags(page_of("x")).found | Tags(page_of("")).found
+
+
+def page_of(text: str) -> str:
+    report = report_with(text).model_copy(update={"machine": "press-3", "site": "hall-1"})
+    values = {text: [1.0, text, text]}
+    description = {"title": text, "equations": [[text, text]], "values": values, "limits": {}, "sites": {}}
+    reader = written([report], description=json_text(description))
+    return html_report(reader, reader.samples(WINDOW, START), "window", START, START + 60.0)
+
+
+def kept(text: str) -> str:
+    """What the history gives back of a report."""
+    report = report_with(text).model_copy(update={"machine": "press-3", "site": "hall-1"})
+    return str(written([report]).latest(1)[0].to_json())
+
+
+def is_kept(text: str, written: str) -> None:
+    read, expected = ReportDocument.from_json(written), report_with(whole(text))
+    assert (read.driver, read.notes, read.twin) == (expected.driver, expected.notes, expected.twin)
+
+
+def sent_to_a_command(text: str) -> str:
+    """What ``on_event`` gets on its standard input."""
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "event"
+        script = f"cat > {target}.new && mv {target}.new {target}"
+        command = EventCommand(["/bin/sh", "-c", script], "m", "s")
+        command.run(report_with(text).events[0])
+        wait_for(target.exists)
+        command.stop(5.0)
+        return target.read_text(encoding="utf-8")
+
+
+def is_the_event(text: str, written: str) -> None:
+    assert_lines(written, 1)
+    assert EventDocument.model_validate(json.loads(written)["event"]) == report_with(whole(text)).events[0]
+
+
+def told_to_systemd(text: str) -> str:
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"{folder}/notify")
+        notifier = Notifier({"NOTIFY_SOCKET": f"{folder}/notify"})
+        notifier.send("READY=1", f"STATUS=listening: {text}")
+        notifier.close()
+        return manager.recv(1 << 20).decode()
+
+
+def are_two_assignments(_: str, written: str) -> None:
+    assert_lines(written, 2)
+    assert written.startswith("READY=1\nSTATUS=listening: ")
+
+
+def is_markdown_like(write: Callable[[str], str]) -> Callable[[str, str], None]:
+    """The text has the same lines and cells as a harmless one."""
+
+    def shape(markdown: str) -> list[int]:
+        return [len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in markdown.split("\n")]
+
+    def check(text: str, written: str) -> None:
+        assert_lines(written)
+        assert not text or shape(written) == shape(write("x"))
+
+    return check
+
+
+def marked(write: Callable[[ReportDocument], str]) -> Writer:
+    def of(text: str) -> str:
+        return write(report_with(text).model_copy(update={"machine": "press-3", "site": "hall-1"}))
+
+    return Writer(of, is_markdown_like(of))
+
+
+def logged_by_the_recorder(text: str) -> str:
+    (shown, _) = _columns(LOG, [(np.array(0), (text, "WARN"))])
+    return str(shown.as_arrow_array()[0].as_py()[0])
+
+
+DOCUMENTS = {
+    "HTML": Writer(page_of, is_a_page),
+    "history": Writer(kept, is_kept),
+    "command": Writer(sent_to_a_command, is_the_event),
+    "systemd": Writer(told_to_systemd, are_two_assignments),
+    "recording: state": marked(operator_text),
+    "recording: report": marked(report_text),
+    "recording: log": Writer(logged_by_the_recorder, lambda _, written: assert_lines(written, 1)),
+}
+"""Writers that take some milliseconds."""
+BOUNDED, MOST = {"HTML", "history"}, 1 << 14
+"""Writers behind the guard of drivers, which cuts their texts; the database has a size; and so many characters."""
+
+
+def refused_or(write: Callable[[str], str]) -> Callable[[str], str]:
+    def written_or_nothing(text: str) -> str:
+        try:
+            return write(text)
+        except (ConfigurationError, ValueError):
+            return ""
+
+    return written_or_nothing
+
+
+def is_one_name(_: str, written: str) -> None:
+    assert not written or re.fullmatch(r"[A-Za-z0-9_./-]+", written)
+    assert written.count("/") in (0, 2)  # of a key of Zenoh: otolith/SITE/MACHINE
+    assert ".." not in written
+
+
+def machine_of(text: str) -> tuple[str, str]:
+    table = MachineTable.model_validate({"name": text, "site": text})
+    return table.site, table.name
+
+
+def is_a_line_of_a_unit(text: str, written: str) -> None:
+    assert not written or written == f"DeviceAllow={text}"
+    assert_lines(written, 1)
+
+
+NAMES = {
+    "key of Zenoh": Writer(refused_or(lambda text: prefix(*machine_of(text))), is_one_name),
+    "file name": Writer(refused_or(lambda text: path_in(Path(), *machine_of(text)).name), is_one_name),
+    "unit": Writer(refused_or(lambda text: directive("DeviceAllow", text)), is_a_line_of_a_unit),
+    "comment of a unit": Writer(comment, lambda _, written: assert_lines(written, 1)),
+}
+
 WRITERS = {
+    **NAMES,
     **{f"TOML: {name}": writer for name, writer in TOML.items()},
     **{f"terminal: {name}": writer for name, writer in TERMINAL.items()},
     **{f"JSON: {name}": writer for name, writer in JSON.items()},
@@ -237,7 +394,9 @@ def test_any_text_is_escaped(name: str, text: str) -> None:
     WRITERS[name].check(text, WRITERS[name].write(text))
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", [*WRITERS, *DOCUMENTS])
 def test_each_attack_is_escaped(name: str) -> None:
+    writer = {**WRITERS, **DOCUMENTS}[name]
     for text in HOSTILE:
-        WRITERS[name].check(text, WRITERS[name].write(text))
+        some = text[:MOST] if name in BOUNDED else text
+        writer.check(some, writer.write(some))

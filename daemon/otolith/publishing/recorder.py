@@ -42,6 +42,7 @@ from otolith.machine import RecordedMachine
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith.twin.definition import Input, Output
 from otolith_drivers import keep_pandas_out
+from otolith_drivers.outside_text import visible
 from otolith_drivers.replay.recording import packed
 from otolith_drivers.units import equation_text, quantity_text, unit_text
 
@@ -330,7 +331,7 @@ def _columns(entity: str, rows: list[tuple[Times, Any]]) -> Any:
         return rr.AnyValues.columns(window=values)  # one column: 'rerun rrd optimize' separates large ones
     if entity in (LOG, EVENTS):
         texts, levels = zip(*values, strict=True)
-        return rr.TextLog.columns(text=list(texts), level=list(levels))
+        return rr.TextLog.columns(text=list(map(visible, texts)), level=list(levels))
     if entity.startswith("state/"):
         return rr.StateChange.columns(state=values)
     if entity in (REPORT, OPERATOR):
@@ -422,8 +423,8 @@ def _paragraph(event: EventDocument, worst: Level) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text that is not Markdown, as ``N*m`` would be, in Markdown."""
-    return re.sub(r"([\\`*_<>#|\[\]])", r"\\\1", text)
+    """Return text that is not Markdown, as ``N*m`` would be, in Markdown: one line, also in a table."""
+    return re.sub(r"([\\`*_<>#|\[\]!])", r"\\\1", visible(text))
 
 
 def report_text(document: ReportDocument) -> str:
@@ -431,18 +432,22 @@ def report_text(document: ReportDocument) -> str:
     texts = texts_in("en" if document.health is None else document.health.language)
     rows = [f"# {document.machine}, {document.site}", ""]
     current = [event for event in document.events if event.end is None]
-    rows += [] if document.health is None else [headline(document.health, events=current), ""]
+    rows += [] if document.health is None else [_plain(headline(document.health, events=current)), ""]
     say, columns = texts.translated, "| {} | {} | {} |\n|---|---|---|"
     rows += [columns.format(say("parameter"), say("value"), say("status"))]
     parameters = document.parameters.items()
-    rows += [f"| {name} | {say(value_text(row))} | {say(row.status)} {row.reason} |" for name, row in parameters]
+    rows += [
+        f"| {_plain(name)} | {_plain(say(value_text(row)))} | {_plain(f'{say(row.status)} {row.reason}')} |"
+        for name, row in parameters
+    ]
     if document.components:
         rows += ["", columns.format(say("component"), say("equation"), say("status"))]
         rows += [
-            f"| {say(row.meaning)} | {equation_text(row.equation)} | {say(row.status)}, {approval_text(row, texts)} |"
+            f"| {_plain(say(row.meaning))} | {_plain(equation_text(row.equation))} | "
+            f"{_plain(f'{say(row.status)}, {approval_text(row, texts)}')} |"
             for row in document.components
         ]
-    rows += [f"\n{event_text(event)}" for event in current]
+    rows += [f"\n{_plain(event_text(event))}" for event in current]
     return "\n".join(rows)
 
 

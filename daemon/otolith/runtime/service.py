@@ -61,6 +61,7 @@ RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writi
 STALL_TIMEOUT = 30.0  # s of effort without a finished window, and three window lengths; then no watchdog is fed
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
+MAX_STATUS = 1000  # characters of what systemd is told: a datagram that is too long would be lost
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
 
@@ -135,7 +136,7 @@ class Notifier:
         """Send assignments such as ``READY=1``; line breaks in them are escaped, as each line is an assignment."""
         if self._socket is None:
             return
-        text = "\n".join(map(visible, assignments))
+        text = "\n".join(visible(assignment, MAX_STATUS) for assignment in assignments)
         try:  # MSG_DONTWAIT: a full queue must not block; a dropped message is repeated by the next one
             self._socket.sendmsg([text.encode()], [], socket.MSG_DONTWAIT, self._address)
         except OSError:

@@ -34,6 +34,7 @@ from otolith.storage.history_safety import QUERY_TIME, Unpacker, bound, moment, 
 from otolith.storage.history_schema import check, upgrade
 from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.grammars.json_lines import json_text
 from otolith_drivers.user_dirs import state_directory
 
 Content = TypeVar("Content")
@@ -115,7 +116,7 @@ def describe_machine(twin: Definition, plan: MonitoringPlan, log: Mapping[str, A
               for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
-    return json.dumps({**texts, "values": values, "limits": limits, "sites": sites}, ensure_ascii=False)
+    return json_text({**texts, "values": values, "limits": limits, "sites": sites})
 
 
 class _Description(BaseModel):
