@@ -5,7 +5,8 @@ import pytest
 from otolith.discovery.decision import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.observations import MIN_RETURNS, PERSISTENT_WINDOWS, RELEASE_WINDOWS
-from otolith.health.schema import EventChange, FindingKind
+from otolith.health.schema import EventChange, FindingKind, Status
+from otolith.health.text import duration_text
 from tests.health.test_events import LENGTH, NOMINAL, SENSOR, assessed, changes, events, report, sensor_reports
 
 
@@ -104,3 +105,38 @@ def test_times_that_go_back_move_no_begin_and_no_event_ends_before_its_begin() -
         assert min(begins) >= 0.0
         assert {event.start for event in document.events} <= {20.0}
         assert all(event.end is None or event.end >= event.since for event in document.events)
+
+
+def test_no_data_that_comes_and_goes_is_no_state_of_windows_that_are_estimated() -> None:
+    """The event stays, so that it is not raised again and again; but it says that it is not there at present."""
+    last = 50
+    documents = assessed(
+        report(index, decision=WindowDecision.BAD, status=Status.HELD) if index < last and index % 10 >= 5
+        else report(index) for index in range(last + 2 * RELEASE_WINDOWS)
+    )  # fmt: skip
+    assert [change for _, change, _ in changes(documents)].count(EventChange.RAISED) == 2
+    for index, document in enumerate(documents[20:], 20):
+        health = document.health
+        assert health is not None
+        present = {part.state is Level.NO_DATA for part in (health, *health.parts.values())}
+        if index % 10 in (3, 4) or index >= last + PERSISTENT_WINDOWS - 1:  # estimated for three windows at least
+            assert present == {False}, index
+        elif index % 10 in (8, 9) and index < last:
+            assert True in present, index
+    held = documents[last + PERSISTENT_WINDOWS : last + RELEASE_WINDOWS - 1]
+    assert held
+    for index, document in enumerate(held, PERSISTENT_WINDOWS + 1):
+        (event,) = document.events
+        assert event.state is Level.NO_DATA
+        assert "not seen for" in event.text
+        assert duration_text(LENGTH * index) in event.text
+    assert documents[-1].events == ()
+
+
+def test_an_event_that_is_there_again_says_nothing_of_the_time_without_it() -> None:
+    values = [5.8 if index % 10 >= 5 else NOMINAL for index in range(60)]
+    documents = assessed(report(index, value) for index, value in enumerate(values))
+    texts = [event.text for document in documents[40:] for event in document.events]
+    assert any("not seen for" in text for text in texts)
+    assert all(text.count("not seen for") <= 1 for text in texts)
+    assert "not seen for" not in documents[48].events[0].text

@@ -7,6 +7,7 @@ Times are those of the windows. A window that determines nothing about a conditi
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Any
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
@@ -39,6 +40,7 @@ from otolith.health.schema import (
     Status,
     WindowDocument,
 )
+from otolith.health.text import PARTS, duration_text
 
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
 OF_DATA = ("data", "source/", "temperature/", OUTPUT)  # Begins of the keys of conditions that nothing was learned for
@@ -59,6 +61,18 @@ class ConditionRecord:
     def is_over(self, window: int) -> bool:
         """Whether nothing of it has to be carried on after the window with this index."""
         return self.event is None and not self.returns(window) and all(level is Level.OK for level, _ in self.recent)
+
+    @property
+    def quiet(self) -> tuple[WindowDocument, ...]:
+        """The last windows without it that were judged, one after the other."""
+        return tuple(window for level, window in takewhile(lambda item: item[0] is Level.OK, reversed(self.recent)))[
+            ::-1
+        ]
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether its event is held open only because it may come again: an ordinary one would be over."""
+        return self.event is not None and len(self.quiet) >= PERSISTENT_WINDOWS
 
     def returns(self, window: int) -> bool:
         """Whether an event of it that begins in the window with this index is one that comes and goes."""
@@ -138,23 +152,35 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
     state = _with_doubts(replace(state, undetermined=undetermined), report)
     observations = _observations(plan, state, report, is_moving=is_moving)
-    records, events = {}, []
+    records, events, absent = {}, list[EventDocument](), set[str]()
     for key, observed in observations.items():
         own = observed if key in state.inside else _from_start(observed)
         record = _advance(plan, state.records.get(key, ConditionRecord()), own, report)
         if record.event is not None:
-            events.append(record.event)
+            events.append(_published(plan, record, report))
+            # Of windows that are estimated it is not true that nothing is known.
+            absent |= {record.event.id} if record.is_absent and record.event.state is Level.NO_DATA else set()
             if record.event.end is not None:
                 record = replace(record, event=None, cleared=report.window.index)
         if not record.is_over(report.window.index):
             records[key] = record
     events += [_ended(plan, event, report.window.start) for event in state.dropped]
     events.sort(key=lambda event: -event.state.rank)
-    current = [event for event in events if event.end is None]
+    current = [event for event in events if event.end is None and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=())
     return state, report.model_copy(update={"health": document, "events": tuple(events)})
+
+
+def _published(plan: MonitoringPlan, record: ConditionRecord, report: ReportDocument) -> EventDocument:
+    """Return the event of a record, which says for how long it was not seen if it is only held open."""
+    event = record.event
+    assert event is not None  # noqa: S101 - for mypy
+    if event.end is not None or not record.is_absent:
+        return event
+    pause = plan.texts("absent", duration=duration_text(report.window.end - record.quiet[0].start))
+    return event.model_copy(update={"text": PARTS.join(filter(None, (event.text, pause)))})
 
 
 def _observations(
