@@ -65,9 +65,8 @@ class ConditionRecord:
     @property
     def quiet(self) -> tuple[WindowDocument, ...]:
         """The last windows without it that were judged, one after the other."""
-        return tuple(window for level, window in takewhile(lambda item: item[0] is Level.OK, reversed(self.recent)))[
-            ::-1
-        ]
+        latest = takewhile(lambda item: item[0] is Level.OK, reversed(self.recent))
+        return tuple(window for _, window in latest)[::-1]
 
     @property
     def is_absent(self) -> bool:
