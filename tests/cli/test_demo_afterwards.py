@@ -59,14 +59,14 @@ def test_the_last_line_of_a_demo_works_when_pasted(tmp_path: Path, monkeypatch: 
     command = last.partition(": ")[2]
     pasted = subprocess.run(shlex.split(command), capture_output=True, text=True, check=True)
     text = Page((tmp_path / pasted.stdout.strip()).read_text(encoding="utf-8")).text
-    assert_says(text, "6.5 Ω", "state at the last report")
+    assert_says(text, "6.500 ± 0.020 Ω", "state at the last report")
     assert "NO DATA" not in text
 
 
 def test_a_name_without_a_machine_means_the_last_demo() -> None:
     demo("20260101T120000-7", 500.0, 6.1)
     demo("20260101T130000-5", 300.0, 6.3)
-    assert_says(shown_page(), "6.3 Ω", "state at the last report")
+    assert_says(shown_page(), "6.300 ± 0.020 Ω", "state at the last report")
     result = run("history", MACHINE, "--since", "1m")
     assert "6.3" in result.stdout
     assert "20260101T130000-5" in result.stderr  # nobody takes it for a machine
@@ -75,7 +75,7 @@ def test_a_name_without_a_machine_means_the_last_demo() -> None:
 def test_a_machine_goes_before_a_demo() -> None:
     demo("20260101T130000-5", 300.0, 6.3)
     keep(history_path(SITE, MACHINE), time.time(), 6.7)
-    assert "6.7 Ω" in shown_page()
+    assert "6.700 ± 0.020 Ω" in shown_page()
 
 
 def test_an_unknown_name_is_refused_all_the_same() -> None:

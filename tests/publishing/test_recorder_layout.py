@@ -25,7 +25,7 @@ def test_the_text_has_state_what_since_when_how_sure_and_what_to_do() -> None:
     assert text.startswith("# ACT\n\n## winding: short circuit between turns of the winding\nsince ")
     assert text.count("ACT") == text.count("since ") == 1
     for part in (
-        "R\\_a is 5.8 Ω",
+        "R\\_a is 5.800 ± 0.020 Ω",
         "% probability)",
         "**What to do: plan a replacement of the winding",
     ):
@@ -90,7 +90,7 @@ def test_each_parameter_has_nominal_value_and_near_limits_all_the_time(recorded:
     assert np.unique(np.array(values), axis=0) == pytest.approx(np.array([[6.5, 6.37, 6.175]]))
     plan = load_machine(EXAMPLES / "dc-motor.toml", with_driver=False).plan
     names = [name for name, _, _ in limit_lines(plan.parameters["R_a"], plan.texts)]
-    assert names == ["nominal 6.5", "WATCH 6.37", "ACT 6.175", "WATCH 8.125", "ACT 9.425"]
+    assert names == ["nominal 6.5 Ω", "WATCH 6.37 Ω", "ACT 6.175 Ω", "WATCH 8.125 Ω", "ACT 9.425 Ω"]
 
 
 def test_a_far_limit_is_shown_to_a_value_near_it() -> None:

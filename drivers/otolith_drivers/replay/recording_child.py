@@ -27,7 +27,7 @@ def main(path: Path, out: BinaryIO) -> None:
     size, before = max(path.stat().st_size, 1), _bytes_read()
 
     def send(letter: bytes, content: bytes = b"") -> None:
-        out.write(PART.pack(letter, len(content), min(1.0, (_bytes_read() - before) / size)) + content)
+        out.writelines((PART.pack(letter, len(content), min(1.0, (_bytes_read() - before) / size)), content))
 
     try:
         with warnings.catch_warnings(record=True) as raised:
