@@ -277,6 +277,7 @@ def test_a_thread_of_a_driver_that_ends_by_an_exception_is_named(caplog: pytest.
 
     with machine_with(Threaded()) as (machine, _), caplog.at_level(logging.ERROR):
         wait_for(lambda: "IndexError: no more bytes" in events(machine.link()).get("plug-in", ""))
+        wait_for(lambda: "restart the daemon" in caplog.text)  # it is logged after it is stated
         assert caplog.text.count("restart the daemon") == 1
         deliveries[0]([Sample("x", time.monotonic(), 1.0)])
         assert not events(machine.link())

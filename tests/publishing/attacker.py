@@ -1,7 +1,8 @@
 """A client of Zenoh that publishes what it must not, in a process and, if it is root, as a user of its own.
 
-Its argument is a JSON object: ``connect``, ``settings``, ``uid``. It prints ``refused`` if no session opens. Otherwise
-it attacks, prints ``attacked``, waits for the end of its standard input, and prints what it has received.
+Its argument is a JSON object: ``connect``, ``settings``, ``uid``, and ``opening`` and ``answering`` (s): how long it
+waits for a session and for an answer, if not briefly. It prints ``refused`` if no session opens. Otherwise it
+attacks, prints ``attacked``, waits for the end of its standard input, and prints what it has received.
 """
 
 import json
@@ -14,8 +15,7 @@ import zenoh
 FORGED = "forged"
 KEY = "otolith/here/motor/report"
 GHOST = "otolith/here/ghost"
-ANSWERING = 2.0  # s
-OPENING = 1500  # ms: a session that is accepted opens in some 10 ms
+BRIEFLY = 2.0  # s: a session that is accepted opens in some 10 ms, and its query is answered at once
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
     settings = {
         "mode": "client",
         "connect/endpoints": [given["connect"]],
-        "connect/timeout_ms": OPENING,
+        "connect/timeout_ms": round(1000 * given.get("opening", BRIEFLY)),
         "scouting/multicast/enabled": False,
         **given.get("settings", {}),
     }
@@ -55,7 +55,7 @@ def main() -> None:
         sys.stdout.flush()
         sys.stdin.read()
         # A subscription may arrive after the reports of the test; a query waits for its answer.
-        replies = session.get(KEY, target=zenoh.QueryTarget.ALL, timeout=ANSWERING)
+        replies = session.get(KEY, target=zenoh.QueryTarget.ALL, timeout=given.get("answering", BRIEFLY))
         answers = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
         received += [answer for answer in answers if answer != FORGED]  # its own queryable answers as well
         del ghost, queryable

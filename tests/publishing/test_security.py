@@ -88,12 +88,18 @@ class Reader:
 
 @contextmanager
 def attack(
-    endpoint: str, settings: dict[str, Any] | None = None, uid: int = 0
+    endpoint: str, settings: dict[str, Any] | None = None, uid: int = 0, opens: bool = False, answers: bool = False
 ) -> Iterator[Callable[[], list[str] | None]]:
-    """Attack from another process; the function ends it and returns what it received, None if it was refused."""
-    given = json.dumps({"connect": endpoint, "settings": settings or {}, "uid": uid})
+    """Attack from another process; the function ends it and returns what it received, None if it was refused.
+
+    A refusal costs a moment's wait; a session that ``opens``, and one that ``answers``, has as long as a busy computer
+    needs.
+    """
+    given: dict[str, Any] = {"connect": endpoint, "settings": settings or {}, "uid": uid}
+    given |= {"opening": PATIENCE} if opens or answers else {}
+    given |= {"answering": PATIENCE} if answers else {}
     process = subprocess.Popen(
-        [sys.executable, attacker.__file__, given], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, attacker.__file__, json.dumps(given)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     with process:
         assert process.stdout is not None
@@ -133,7 +139,7 @@ def test_the_attack_succeeds_against_a_session_without_access_control(stack: Exi
     endpoint = tcp()
     stack.callback(session(listen=[endpoint]).close)
     victim = reader(stack, endpoint)
-    with attack(endpoint):
+    with attack(endpoint, answers=True):
         wait_for(lambda: f"{attacker.GHOST}/alive" in victim.alive)
         wait_for(lambda: victim.queried() == [attacker.FORGED])
 
@@ -143,7 +149,7 @@ def test_nobody_but_the_daemon_publishes_under_its_keys(stack: ExitStack) -> Non
     daemon = publisher(stack, endpoint)
     victim = reader(stack, endpoint)
     victim.receives(daemon)
-    with attack(endpoint) as received:
+    with attack(endpoint, answers=True) as received:
         texts = victim.receives(daemon)
         latest = victim.queried()
         assert received()  # everybody may read on this computer
@@ -166,7 +172,7 @@ def test_another_user_cannot_open_the_socket(stack: ExitStack) -> None:
         assert received() is None
     assert own.receives(daemon) == EXPECTED
     os.chown(path, -1, STRANGER)  # its group
-    with attack(endpoint, uid=STRANGER) as received:
+    with attack(endpoint, uid=STRANGER, answers=True) as received:
         own.receives(daemon)
         assert received()
 
@@ -205,7 +211,7 @@ def test_only_readers_with_a_certificate_read_over_the_network(stack: ExitStack,
     for address, settings in refused:
         with attack(address, settings) as received:
             assert received() is None
-    with attack(endpoint, visitor) as received:  # the session opens, but nothing passes
+    with attack(endpoint, visitor, opens=True) as received:  # the session opens, but nothing passes
         own.receives(daemon)
         assert received() == []
     assert own.receives(daemon) == EXPECTED
@@ -235,7 +241,7 @@ def test_only_users_with_their_password_read(stack: ExitStack, tmp_path: Path) -
         settings = {"transport/auth/usrpwd": {"user": user, "password": password}} if user else {}
         with attack(endpoint, settings) as received:
             assert received() is None
-    with attack(endpoint, {"transport/auth/usrpwd": {"user": "visitor", "password": "also"}}) as received:
+    with attack(endpoint, {"transport/auth/usrpwd": {"user": "visitor", "password": "also"}}, opens=True) as received:
         own.receives(daemon)
         assert received() == []
     assert own.receives(daemon) == EXPECTED
