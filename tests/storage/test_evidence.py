@@ -488,3 +488,20 @@ def test_the_files_of_a_bundle_are_those_of_the_machine(bundles: list[Path], fol
         archive.extractall(folder)
     read = load_machine(folder / MACHINE, with_driver=False)
     assert (read.problem, read.plan, read.twin) == (FILE.problem, FILE.plan, FILE.twin)
+
+
+@pytest.mark.parametrize("kind", ["files", "values", "depth"])
+def test_a_small_bundle_is_little_work(folder: Path, kind: str) -> None:
+    path = folder / "small.zip"
+    content = {"files": "{}", "values": f"[{'[],' * 10_000_000}1]", "depth": "[" * 10_000_000}[kind]
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(EVIDENCE, content)
+        archive.writestr(TWIN, "")
+        for number in range(100 if kind == "files" else 0):
+            archive.writestr(f"{number}", "")
+    begin = time.process_time()
+    with pytest.raises(ConfigurationError) as raised:
+        read_bundle(path)
+    assert str(raised.value).startswith(f"{path}: ")
+    assert {"files": "files", "values": "values", "depth": "values"}[kind] in str(raised.value)
+    assert time.process_time() - begin < 2.0

@@ -64,8 +64,11 @@ MAX_EVIDENCE_BYTES = 64 << 20  # of a bundle, packed and unpacked
 MAX_BUNDLES = 1000  # of a machine
 MIN_WINDOWS = 16  # before a change of an event that its bundle has, and at most twice as many
 MAX_WINDOW_BYTES = 8 << 20  # of windows after which fewer are enough
+MAX_ENTRIES = 32  # files of a bundle; it has three, and packed data may have the mark of one by chance
+MAX_VALUES = 1 << 20  # of a bundle's JSON: each takes some 60 bytes of memory for the 3 that it may take in the file
 MAX_REASON = 300  # characters of the error of a library
 MAX_WAITING_BUNDLES = 4  # for the disk; more are dropped
+ENTRY = b"PK\x01\x02"  # before each file in the directory of an archive
 REFERENCE, AUGMENTED, BITS = "=", "augmented", "bits"  # keys of an object that occurred before, a twin, and an array
 
 
@@ -234,9 +237,15 @@ def read_bundle(path: Path) -> Bundle:
 
 def _read_bundle(path: Path) -> Bundle:
     with path.open("rb") as stream:
-        archive = zipfile.ZipFile(io.BytesIO(_limited(stream, MAX_EVIDENCE_BYTES)))
+        packed = _limited(stream, MAX_EVIDENCE_BYTES)
+    if (count := packed.count(ENTRY)) > MAX_ENTRIES:
+        raise ValueError(f"{count} files in it: at most {MAX_ENTRIES}")
+    archive = zipfile.ZipFile(io.BytesIO(packed))
     with archive.open(EVIDENCE) as evidence, archive.open(TWIN) as text:
-        content = json.loads(_limited(evidence, MAX_EVIDENCE_BYTES))
+        written = _limited(evidence, MAX_EVIDENCE_BYTES)
+        if (count := written.count(b",") + written.count(b"[") + written.count(b"{")) > MAX_VALUES:
+            raise ValueError(f"{count} values in it: at most {MAX_VALUES}")
+        content = json.loads(written)
         twin = read_twin(SourceFile(Path(TWIN), _limited(text, FILE_SIZE_LIMIT).decode()))
     if (number := content["version"]) != VERSION:
         raise ValueError(f"version {number!r:.20} of the format: this Otolith reads {VERSION}")

@@ -7,7 +7,7 @@ becomes a fault of the file, of a message or of a signal; only a fault of a requ
 import logging
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,20 +24,24 @@ SIZE_LIMIT = 4 << 20  # bytes; databases of large vehicles have 2 MB, and take s
 MAX_MESSAGE_LENGTH = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
 STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF  # arbitration IDs of 11 and of 29 bits
 MAX_RANGE = 1 << 16  # values of one multiplexer, and arbitration IDs of one message
+MAX_VALUES = 1 << 20  # of all multiplexers, or arbitration IDs of all messages
+MAX_WORK = 1 << 24  # pairs of signals of one message, and bits of signals, of all messages: what reading a file costs
+MAX_MESSAGES = 1 << 14  # of a DBC; that of all of SAE J1939 has some 3000
+MAX_PAIRS_NAMED = 20  # overlaps of one message that are named as pairs
 SHEETS = (".eds", ".dcf")
 FORMATS = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym", ".arxml": "arxml"}
 KEY = ("driver", "dbc")
 
 # cantools makes lists as long as these numbers, so a wrong one could fill the memory.
 LENGTHS = re.compile(
-    r"(?:^\s*BO_\s+\d+\s+\S+\s*:\s*|\|\s*(?=\d+\s*@)|:\s*(?=\d+\s*\|)|\blength=[\"']|\boffset=[\"']|\bLen\s*=\s*|"
+    r"(?:^[ \t]*BO_\s+\d+\s+\S+\s*:\s*|\|\s*(?=\d+\s*@)|:\s*(?=\d+\s*\|)|\blength=[\"']|\boffset=[\"']|\bLen\s*=\s*|"
     r"\b(?:un)?signed\s+|<(?:[\w-]*LENGTH|START-POSITION)>\s*)(\d+)",
     re.MULTILINE,
 )
-SYM_PLACES = re.compile(r"^\s*(?:Mux|Var|Sig)\s*=[^/\n]*?\s(\d+)\s*(?:,\s*(\d+)|-|/|$)", re.MULTILINE)
-MULTIPLEXERS = re.compile(r"\bSG_MUL_VAL_\s[^;]*;")
+SYM_PLACES = re.compile(r"^[ \t]*(?:Mux|Var|Sig)\s*=[^/\n]*?\s(\d+)\s*(?:,\s*(\d+)|-|/|$)", re.MULTILINE)
+MULTIPLEXERS = re.compile(r"\bSG_MUL_VAL_\s[^;]*+(?:;|\Z)")  # one without an end is read once, not from each place
 RANGES = re.compile(r"\b(\d+)\s*-\s*(\d+)\s*[,;]")
-IDENTIFIERS = re.compile(r"^\s*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", re.MULTILINE)
+IDENTIFIERS = re.compile(r"^[ \t]*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", re.MULTILINE)
 # The parts of a DBC that describe frames; comments, attributes and tables of values may be broken.
 DBC_MESSAGE = re.compile(r"^[ \t]*BO_ .*(?:\r?\n[ \t]*(?:\r?\n[ \t]*)*SG_ .*)*", re.MULTILINE)
 DBC_REFERENCE = re.compile(r"(\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s+)(\d+)\b")
@@ -47,7 +51,7 @@ DBC_WITHOUT_NODE = re.compile(
     r'^([ \t]*(?:SG_ [^"\n]*"[^"\n]*"|BO_[ \t]+\d+[ \t]+\w+[ \t]*:[ \t]*\d+))[ \t]*$', re.MULTILINE
 )
 EXTENDED_FLAG = 1 << 31  # of an identifier in a DBC
-DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*;", re.MULTILINE)
+DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*+(?:;|\Z)", re.MULTILINE)
 
 logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings become faults here
 
@@ -105,16 +109,15 @@ def load_database(path: Path) -> CanDatabase:
         multiplexed = _multiplexed_places(text)
     unread: dict[str, str] = {}
     try:
-        parsed = _parse(text, kind, strict=True)
-    except Exception as strict_error:  # noqa: BLE001 - parsers raise exceptions of many types
-        try:
-            parsed = _parse(text, kind, strict=False)
-        except Exception as error:
-            parsed, unread = _parse_each_message(text) if is_dbc else ([], {})
-            if not parsed:
-                raise ConfigurationError(f"{path}: not a CAN database: {_cause(strict_error)}", KEY) from error
-            faults.append(DatabaseFault(f"only its messages could be read: {_cause(error)}"))
-            faults += [DatabaseFault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
+        parsed = _parse(text, kind)
+    except Exception as error:  # parsers raise exceptions of many types
+        parsed, unread = _parse_each_message(text) if is_dbc else ([], {})
+        if not parsed:
+            raise ConfigurationError(f"{path}: not a CAN database: {_cause(error)}", KEY) from error
+        faults.append(DatabaseFault(f"only its messages could be read: {_cause(error)}"))
+        faults += [DatabaseFault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
+    if excess := _excessive_work((len(row.signals), sum(abs(each.length) for each in row.signals)) for row in parsed):
+        raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)
     messages = []
     for message in parsed:
         if why := _why_unusable(message):
@@ -122,7 +125,7 @@ def load_database(path: Path) -> CanDatabase:
             faults.append(DatabaseFault(f"message {message.name} cannot be used: {why}"))
         else:
             messages.append(message)
-            faults += [*_multiplexer_faults(message, multiplexed), *_layout_faults(message)]
+            faults += [*_multiplexer_faults(message, multiplexed), *_signal_faults(message)]
     return CanDatabase(path, tuple(messages), (*faults, *_shared_frames(messages)), unread)
 
 
@@ -148,11 +151,24 @@ def _excess(text: str) -> str:
     numbers = {*LENGTHS.findall(text), *(number for pair in SYM_PLACES.findall(text) for number in pair if number)}
     if any(len(number) > 5 or int(number) > 8 * MAX_MESSAGE_LENGTH for number in numbers):
         return f"it has a length or a start beyond {MAX_MESSAGE_LENGTH} bytes"
-    if any(_is_long(match, 10) for line in MULTIPLEXERS.findall(text) for match in RANGES.finditer(line)):
-        return f"it has a multiplexer of more than {MAX_RANGE} values"
-    if any(_is_long(match, 16) for match in IDENTIFIERS.finditer(text)):
-        return f"it has a message of more than {MAX_RANGE} arbitration IDs"
-    return ""
+    ranges = [_length(match, 10) for line in MULTIPLEXERS.findall(text) for match in RANGES.finditer(line)]
+    if max(ranges, default=0) > MAX_RANGE or sum(ranges) > MAX_VALUES:
+        return f"it has a multiplexer of more than {MAX_RANGE} values, or more than {MAX_VALUES} values in all"
+    ranges = [_length(match, 16) for match in IDENTIFIERS.finditer(text)]
+    if max(ranges, default=0) > MAX_RANGE or sum(ranges) > MAX_VALUES:
+        return f"it has a message of more than {MAX_RANGE} arbitration IDs, or more than {MAX_VALUES} of all messages"
+    sizes = [(block.count("SG_ "), 0) for _, _, block in _dbc_messages(text)]  # none of another format
+    sizes += [(element.count("<Signal "), 0) for element in text.split("<Message ")[1:]]  # of KCD
+    return f"it has more than {MAX_MESSAGES} messages" if len(sizes) > MAX_MESSAGES else _excessive_work(sizes)
+
+
+def _excessive_work(messages: Iterable[tuple[int, int]]) -> str:
+    """What makes messages, with so many signals and bits of signals each, too much work; empty if nothing does."""
+    rows = list(messages)
+    if sum(signals**2 + bits for signals, bits in rows) <= MAX_WORK:
+        return ""
+    most = max(signals for signals, _ in rows)
+    return f"more than {MAX_WORK} pairs of signals of a message and bits of signals; one message has {most} signals"
 
 
 def _dbc_messages(text: str) -> Iterator[tuple[str, str, str]]:
@@ -180,15 +196,18 @@ def _needs_flag(identifier: int) -> bool:
     return STANDARD_LIMIT < identifier <= EXTENDED_LIMIT
 
 
-def _is_long(match: re.Match[str], base: int) -> bool:
-    return max(len(match[1]), len(match[2])) > 10 or int(match[2], base) - int(match[1], base) > MAX_RANGE
+def _length(match: re.Match[str], base: int) -> int:
+    if max(len(match[1]), len(match[2])) > 10:
+        return MAX_RANGE + 1
+    return max(0, int(match[2], base) - int(match[1], base))
 
 
-def _parse(text: str, kind: str | None, *, strict: bool) -> list[Message]:
-    database = cantools.database.load_string(text, kind, strict=strict)
+def _parse(text: str, kind: str | None) -> list[Message]:
+    # Not strict: its check of the layout takes the square of the length for each signal. It is that of _signal_faults.
+    database = cantools.database.load_string(text, kind, strict=False)
     if not isinstance(database, Database):
         raise ValueError("a diagnostics database; a CAN database (DBC, KCD, SYM, ARXML) is needed")  # noqa: TRY004 - a fault of a file
-    if not database.messages and re.search(r"^\s*BO_ ", text, re.MULTILINE):
+    if not database.messages and re.search(r"^[ \t]*BO_ ", text, re.MULTILINE):
         raise ValueError("none of its messages can be read")
     return database.messages
 
@@ -197,13 +216,13 @@ def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str]]:
     """The messages of a DBC that can be parsed alone, and why each of the others cannot."""
     extras: dict[str, list[str]] = defaultdict(list)
     for match in DBC_EXTRA.finditer(text):
-        extras[match[1]].append(match[0])
+        extras[match[1]] += [match[0]] if match[0].endswith(";") else []
     read: list[Message] = []
     unread: dict[str, str] = {}
     for identifier, name, block in _dbc_messages(text):
-        alone = "\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_:", block, *extras[identifier], ""])
+        alone = "\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_:", block, *extras.pop(identifier, ()), ""])
         try:
-            read += _parse(alone, "dbc", strict=False)
+            read += _parse(alone, "dbc")
         except Exception as error:  # noqa: BLE001 - as above
             # The line number is that of the text parsed here, not of the file.
             unread[name] = re.sub(r"at line \d+, column \d+", "at '>>!<<'", _cause(error))
@@ -229,15 +248,6 @@ def _why_unusable(message: Message) -> str:
     if orders := {str(signal.byte_order) for signal in message.signals} - {"little_endian", "big_endian"}:
         return f"one of its signals has the byte order {min(orders)!r}"
     return ""
-
-
-def _layout_faults(message: Message) -> list[DatabaseFault]:
-    """Signals of ``message`` that exceed its frame or overlap."""
-    try:
-        message.refresh(strict=True)
-    except Exception as error:  # noqa: BLE001 - the faults are then named more precisely than by cantools
-        return _signal_faults(message) or [DatabaseFault(f"message {message.name}: {_cause(error)}", message.name)]
-    return []
 
 
 def _multiplexed_places(text: str) -> set[tuple[int, int, int]]:
@@ -278,17 +288,49 @@ def _multiplexer_faults(message: Message, multiplexed: set[tuple[int, int, int]]
 
 
 def _signal_faults(message: Message) -> list[DatabaseFault]:
-    name, faults = message.name, []
+    """Signals of ``message`` that exceed its frame or overlap: all of them, the first overlaps as pairs."""
+    name, faults, overlapping, seen = message.name, [], dict[str, str](), _Occupied()
     masks = [(signal, bits_of(signal)) for signal in message.signals]
     for place, (signal, mask) in enumerate(masks):
         if mask >> (8 * message.length):
             text = f"{name}.{signal.name} lies beyond the {message.length} bytes of its frame"
             faults.append(DatabaseFault(text, name, signal.name))
+        if not seen.add(signal, mask):
+            continue
         for other, other_mask in masks[:place]:
             if mask & other_mask and not _exclude_each_other(signal, other):
                 text = f"{name}.{signal.name} and {name}.{other.name} overlap"
-                faults += [DatabaseFault(text, name, signal.name), DatabaseFault(text, name, other.name)]
-    return faults
+                overlapping.setdefault(signal.name, f"{name}.{signal.name} overlaps with others")
+                overlapping.setdefault(other.name, f"{name}.{other.name} overlaps with others")
+                if len(faults) < MAX_PAIRS_NAMED:
+                    faults += [DatabaseFault(text, name, signal.name), DatabaseFault(text, name, other.name)]
+    named = {fault.signal for fault in faults if fault.text.endswith("overlap")}
+    return [*faults, *(DatabaseFault(text, name, own) for own, text in overlapping.items() if own not in named)]
+
+
+class _Occupied:
+    """The bits of a message that signals take: always, or for one value of a multiplexer."""
+
+    def __init__(self) -> None:
+        self._always = self._any = 0
+        self._of: dict[str, int] = defaultdict(int)
+        self._for: dict[tuple[str, int], int] = defaultdict(int)
+
+    def add(self, signal: CanSignal, mask: int) -> bool:
+        """Take the bits of ``mask``; return whether another signal may have some of them."""
+        multiplexer, values = signal.multiplexer_signal, signal.multiplexer_ids or ()
+        if multiplexer is None:
+            taken, self._always = self._any, self._always | mask
+        else:
+            taken = self._always
+            for other, bits in self._of.items():
+                taken |= bits if other != multiplexer else 0
+            for value in values:
+                taken |= self._for[multiplexer, value]
+                self._for[multiplexer, value] |= mask
+            self._of[multiplexer] |= mask
+        self._any |= mask
+        return bool(taken & mask)
 
 
 def bits_of(signal: CanSignal) -> int:
