@@ -11,7 +11,12 @@ DRIVERS, DAEMON = ROOT / "drivers" / "otolith_drivers", ROOT / "daemon" / "otoli
 SOURCES = {
     "acquisition": [DAEMON / "acquisition"],
     "canbus": [DRIVERS / "canbus"],
-    "cli": [DAEMON / "cli", DAEMON / "cli" / "commissioning", DAEMON / "cli" / "operation", DAEMON / "health"],
+    "cli": [
+        DAEMON / "cli",
+        *(DAEMON / "cli").glob("*/"),
+        DAEMON / "cli" / "commissioning" / "draft",
+        DAEMON / "health",
+    ],
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
     "drivers": [DRIVERS, DRIVERS / "common", DRIVERS / "grammars"],

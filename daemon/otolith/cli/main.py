@@ -15,6 +15,7 @@ import click
 
 from otolith import __version__
 from otolith.cli.commissioning.components import baseline, commission, components, reset
+from otolith.cli.commissioning.draft.command import init
 from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
 from otolith.cli.commissioning.twin import twin
@@ -353,6 +354,7 @@ COMMANDS: tuple[click.Command, ...] = (
     commission,
     components,
     history,
+    init,
     install,
     keys,
     noise,

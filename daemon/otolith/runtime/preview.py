@@ -294,7 +294,7 @@ def _proposed_period(statistics: RecordingStatistics, configured: float) -> floa
     return float(f"{np.clip(fastest, 1e-4, 10.0):.3g}")
 
 
-def _whole_length(length: float, period: float) -> float:
+def whole_length(length: float, period: float) -> float:
     """Return the nearest length in s that a machine file accepts."""
     records = max(round(length / period), MIN_WINDOW_RECORDS, math.ceil(0.1 / period))
     return float(f"{records * period:.9g}")
@@ -307,7 +307,7 @@ def _proposed_length(windows: WindowPreview, duration: float, period: float) -> 
     """
     longest = duration / MIN_PROPOSED_WINDOWS
     if not windows.count:
-        return _whole_length(min(longest, windows.length_s), period)
+        return whole_length(min(longest, windows.length_s), period)
     factors = [
         (accuracy.half_width / accuracy.required) ** 2
         for accuracy in windows.parameters.values()
@@ -315,10 +315,10 @@ def _proposed_length(windows: WindowPreview, duration: float, period: float) -> 
     ]
     wanted = max((factor for factor in factors if factor <= MAX_LENGTHENING), default=1.0) * windows.length_s
     if wanted <= windows.length_s or wanted > longest:
-        return _whole_length(windows.length_s, period)
+        return whole_length(windows.length_s, period)
     digit = 10.0 ** math.floor(math.log10(wanted))
     nice = next(factor * digit for factor in (1.0, 2.0, 5.0, 10.0) if factor * digit >= wanted)
-    return _whole_length(min(nice, longest, 600.0), period)
+    return whole_length(min(nice, longest, 600.0), period)
 
 
 def _with_window(machine: LoadedMachine, length: float, period: float) -> LoadedMachine:

@@ -130,11 +130,17 @@ class ObservedFrames:
         if self.message is not None:
             self._decode(self.message, data)
 
+    def series(self, signal: str) -> list[float]:
+        """The numbers that a signal of the database had in the frames that are kept."""
+        if self.message is None:
+            return []
+        highest = j1939.highest_value(self.message, self.message.get_signal_by_name(signal))
+        numbers = ((_numbers(self.message, data) or {}).get(signal, math.nan) for data in self.history)
+        return [number for number in numbers if math.isfinite(number) and number <= highest]
+
     def _decode(self, message: Message, data: bytes) -> None:
-        try:
-            decoded: Any = message.decode(data, decode_choices=False, allow_truncated=True)
-            numbers = {name: float(value) for name, value in decoded.items()}
-        except Exception:  # noqa: BLE001 - neither the frame nor the database is checked before
+        numbers = _numbers(message, data)
+        if numbers is None:
             self.undecodable += 1
             return
         for signal in message.signals:
@@ -146,6 +152,15 @@ class ObservedFrames:
                 value = self.values.setdefault(signal.name, ObservedValue(number, number, number))
                 value.latest, value.low, value.high = number, min(value.low, number), max(value.high, number)
                 value.beyond += not within(signal, number)
+
+
+def _numbers(message: Message, data: bytes) -> dict[str, float] | None:
+    """The numbers of the signals in a frame; None if it cannot be decoded."""
+    try:
+        decoded: Any = message.decode(data, decode_choices=False, allow_truncated=True)
+        return {name: float(value) for name, value in decoded.items()}
+    except Exception:  # noqa: BLE001 - neither the frame nor the database is checked before
+        return None
 
 
 def within(signal: CanSignal, number: float) -> bool:

@@ -175,6 +175,19 @@ def open_log(path: Path, setup: Setup, can: Any | None) -> "CanLogReader":
     return CanLogReader(path, tuple(signal.name for signal in setup.signals), decoder_of(can, setup))
 
 
+def frames_in(path: Path) -> Iterator[can.Message]:
+    """The frames of a log; raise ConfigurationError as :class:`CanLogReader` does, or if it has none."""
+    data, count = DataFile(path), 0
+    with closing(data):
+        source = _frames_of(path, data)
+        for _, frame in source.frames():
+            if not isinstance(frame, str) and abs(frame.timestamp) <= MAX_TIME:
+                count += 1
+                yield frame
+    if not count:
+        raise ConfigurationError(f"{path}: no frames")
+
+
 class CanLogReader(Reader):
     """A CAN log of any format that python-can reads."""
 

@@ -112,9 +112,11 @@ class Header:
     widths: tuple[int, int]
     """Minimum and maximum number of cells in a row: columns without a name at the end may be absent."""
     columns: dict[str, Column]  # Of the time and of every signal
-    ignored: tuple[str, ...]  # Names of the columns that no signal uses
     segment: int | None = None  # Position of the column of segments in a row, from 0
     below: str = ""  # The lines below it that were read and may be rows
+    others: tuple[tuple[str, int, str | None], ...] = ()
+    """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
+    beside: tuple[list[str], ...] = ()  # Cells of the lines that may have units: some below it, and the one above
 
 
 @dataclass(slots=True)
@@ -171,12 +173,12 @@ class TableReader(Reader):
             name: ColumnRequest(source.column or name, units[name], source.unit) for name, source in named.items()
         }
         try:
-            self._text = _decoded(path, data)
+            self._text = decoded(path, data)
             self._header = read_header(path, self._text, self._wanted)
         except BaseException:
             data.close()
             raise
-        self.ignored = self._header.ignored
+        self.ignored = tuple(name for name, _, _ in self._header.others)
         for name, source in named.items():
             limits = (ordinary or {}).get(name)
             limits = limits and self._header.columns[name].written(limits)
@@ -240,7 +242,7 @@ class TableReader(Reader):
         return [f"{bad}, the first in line {line}: {cause}", *lines]
 
 
-def _decoded(path: Path, data: DataFile) -> TextIO:
+def decoded(path: Path, data: DataFile) -> TextIO:
     """The text of a table with any line ends, in UTF-8, UTF-16 with its mark, or Windows-1252."""
     start = data.stream.peek()
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -280,7 +282,7 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
             continue
         sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
         cells = _split_quoted(line, sign)
-        if commented and all(_is_number(cell) for cell in cells if cell):  # numpy writes names as a comment
+        if commented and all(is_number(cell) for cell in cells if cell):  # numpy writes names as a comment
             number, rows, cells = number - 1, [line], _split_quoted(commented, sign)
         elif is_comment:
             commented = line.lstrip("# ")
@@ -289,13 +291,14 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
             places, others = _places(f"{path}:{number}", cells, wanted)
             break
         except ConfigurationError as error:
-            faults.append((sum(not _is_number(cell) for cell in cells if cell), error))
+            faults.append((sum(not is_number(cell) for cell in cells if cell), error))
             above = cells
     else:
         empty = ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
         raise max(faults, key=lambda fault: fault[0], default=(0, empty))[1]
     rows += [line for _ in range(MAX_BELOW - len(rows)) if (line := file.readline(MAX_LINE + 1))]
-    units, skipped = _units_beside(above, [_split_quoted(row, sign) for row in rows], wanted, places)
+    split = [_split_quoted(row, sign) for row in rows]
+    units, skipped = _units_beside(above, split, wanted, places)
     columns: dict[str, Column] = {}
     for signal, request in wanted.items():
         index, written = places[request.column]
@@ -308,18 +311,18 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     is_wanted = SEGMENT in {request.column for request in wanted.values()}
     segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
     widths, below = (named, len(cells)), "".join(rows[skipped:])
-    return Header(path, number + skipped, sign, widths, columns, others, segment, below)
+    return Header(path, number + skipped, sign, widths, columns, segment, below, others, (*split, above))
 
 
 def _places(
     place: str, cells: list[str], wanted: Mapping[str, ColumnRequest]
-) -> tuple[dict[str, Place], tuple[str, ...]]:
-    """The place of each wanted column, and of that of segments if there is one; the names of the other columns."""
+) -> tuple[dict[str, Place], tuple[tuple[str, int, str | None], ...]]:
+    """The place of each wanted column, and of that of segments if there is one; name and place of the others."""
     known = list(dict.fromkeys(request.column for request in wanted.values()))
-    if all(_is_number(cell) for cell in cells if cell):
+    if all(is_number(cell) for cell in cells if cell):
         raise ConfigurationError(f"{place}: numbers, but a header must name the columns: {', '.join(known)}")
     places: dict[str, Place] = {}
-    others, times = list[str](), list[tuple[str, Place]]()
+    others, times = list[tuple[str, int, str | None]](), list[tuple[str, Place]]()
     for index, cell in enumerate(cells):
         name, written = _name_and_unit(cell)
         name = cell if cell in known else name
@@ -328,7 +331,7 @@ def _places(
         if name in known or name == SEGMENT:
             places[name] = (index, written)
         else:
-            others += [name] if name else []
+            others += [(name, index, written)] if name else []
             match = TIME_NAME.fullmatch(name)
             times += [(name, (index, written or (match[1] and match[1].lower())))] if match else []
     if TIME not in places and times:
@@ -338,21 +341,22 @@ def _places(
                 f"{place}: {names} may be the column of the time: rename one to 't [s]' or the like"
             )
         ((name, places[TIME]),) = times
-        others.remove(name)
+        others = [other for other in others if other[0] != name]
     for request in wanted.values():
         if request.column not in places:
-            raise ConfigurationError(f"{place}: {_missing(request, others, cells)}")
+            raise ConfigurationError(f"{place}: {_missing(request, [name for name, _, _ in others], cells)}")
     return places, tuple(others)
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether a cell of the header or near it is a number, with either decimal sign."""
     return re.match(NUMBER, cell.replace(",", ".")) is not None
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
     """The name in a cell of the header, and its unit if it has one; other parentheses belong to the name."""
     name, unit, in_parentheses = HEADER_CELL.findall(cell)[0]
-    if in_parentheses and (_is_number(in_parentheses) or not is_unit(in_parentheses)):
+    if in_parentheses and (is_number(in_parentheses) or not is_unit(in_parentheses)):
         return cell, None
     return name, unit or in_parentheses or None
 
@@ -364,7 +368,7 @@ def _units_beside(
     for number, cells in enumerate(below, 1):
         if units := _units_in(cells, wanted, places):
             return units, number
-        if any(_is_number(cells[index]) for index, _ in places.values() if index < len(cells)):
+        if any(is_number(cells[index]) for index, _ in places.values() if index < len(cells)):
             break
     units = _units_in(above, wanted, places)
     return (units if all(map(is_unit, units.values())) else {}), 0
@@ -376,7 +380,7 @@ def _units_in(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Map
     for request in wanted.values():
         index = places[request.column][0]
         text = cells[index].strip("[]()") if index < len(cells) else ""
-        if _is_number(text):
+        if is_number(text):
             return {}
         if re.match(BLANK, text) or (request.column == TIME and not is_unit(text)):
             continue
@@ -570,7 +574,7 @@ def _numbers(texts: pa.StringArray, decimal: str) -> Array:
 
 def _other_sign(text: str, decimal: str) -> str:
     """A clause for a cell that is a number but for its decimal sign."""
-    return f", but {decimal!r} is the decimal sign of other cells" if decimal and _is_number(text) else ""
+    return f", but {decimal!r} is the decimal sign of other cells" if decimal and is_number(text) else ""
 
 
 def _date(text: str) -> float:

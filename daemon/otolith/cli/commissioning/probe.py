@@ -244,7 +244,7 @@ def can_(
     options = validated({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
     stop = StopSignal()
     begun = time.monotonic()
-    picture = _listen(options, database, seconds, stop, live=not as_json)
+    picture = listen(options, database, seconds, stop, live=not as_json)
     elapsed = time.monotonic() - begun
     if as_json:
         echo_json(can_document(picture, options, database, elapsed))
@@ -255,7 +255,7 @@ def can_(
     return stop.code() or (0 if picture.frames else NOTHING_THERE)
 
 
-def _listen(options: "BusOptions", database: Path | None, seconds: float, stop: StopSignal, *, live: bool) -> "Picture":
+def listen(options: "BusOptions", database: Path | None, seconds: float, stop: StopSignal, *, live: bool) -> "Picture":
     """What came in ``seconds`` s; ``live`` shows it meanwhile if standard output is a terminal. Nothing is sent.
 
     Raises:

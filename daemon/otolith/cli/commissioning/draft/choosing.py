@@ -1,0 +1,238 @@
+"""What ``otolith init`` proposes and asks, from a source to the file: units, twin, signals, window."""
+
+import os
+import re
+import shlex
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, rank
+from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
+from otolith.cli.commissioning.draft.questions import Questions
+from otolith.cli.commissioning.draft.writing import (
+    MachineDraft,
+    ReadSignal,
+    machine_file_text,
+    meaning_of,
+    proposed_length,
+    proposed_noise,
+    proposed_period,
+)
+from otolith.cli.commissioning.probe_view import fitted_tables, stdout_console
+from otolith.cli.terminal import echo
+from otolith.machine import find_twin, library_twins, load_machine
+from otolith.machine_file import check_name
+from otolith.runtime.preview import duration_text
+from otolith.twin.definition import Definition
+from otolith_drivers.errors import ConfigurationError, ServiceError, nearest
+from otolith_drivers.outside_text import CONTROL
+from otolith_drivers.units import Quantity, factor, is_unit
+
+ASSUMPTIONS = ("constant", "slow", "friction")
+MAX_SHOWN = 40  # rows of the table of offers
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """What options have answered."""
+
+    twin: str | None = None
+    signals: Mapping[str, str] = field(default_factory=dict)
+    unknown: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    scales: Mapping[str, str] = field(default_factory=dict)
+    noises: Mapping[str, str] = field(default_factory=dict)
+    name: str | None = None
+    site: str | None = None
+    sample_period: str | None = None
+    window: str | None = None
+
+
+def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: Questions) -> None:
+    """Show what ``source`` offers, choose, ask, and write ``file``.
+
+    Raises:
+        ConfigurationError: no twin fits, or an answer is none.
+    """
+    writable = [offer for offer in source.offers if not CONTROL.search(offer.name)]
+    offers = with_units(writable, answers.units)
+    _show(source, offers)
+    if hidden := [offer.name for offer in source.offers if offer not in writable]:
+        echo(f"! no machine file can name {', '.join(hidden)}: rename what has control characters", "")
+    proposal = _twin(offers, source, answers, questions)
+    signals, assumed = _signals(proposal, offers, answers, questions)
+    proposed = f"{1e3 * proposed_period([read.offer for read in signals.values()]):.6g} ms"
+    period = questions.text("Sample period", answers.sample_period or proposed, _seconds).removesuffix(" s")
+    length = proposed_length(float(period), source.duration)
+    window = questions.text("Length of a window", answers.window or f"{length:.9g} s", _seconds).removesuffix(" s")
+    name = answers.name or re.sub(r"[^A-Za-z0-9_-]+", "-", file.stem).strip("-_")[:64] or "machine"
+    draft = MachineDraft(
+        name=questions.text("Name of the machine", name, check_name),
+        site=answers.site,
+        driver=source.driver,
+        twin=proposal.twin,
+        signals=signals,
+        assumed=assumed,
+        noise=proposed_noise(signals, proposal.twin) | dict(answers.noises),
+        period=float(period),
+        length=float(window),
+    )
+    _write_checked(file, machine_file_text(draft))
+    echo("", f"written: {file}")
+    echo("[parameters] has the values of the twin's example: write those of your machine")
+    behind = f" {shlex.quote(source.check)}" if source.check else ""
+    echo(f"next: otolith check {shlex.quote(str(file))}{behind}")
+
+
+def with_units(offers: Sequence[Offer], units: Mapping[str, str]) -> list[Offer]:
+    """Return the offers with units by their names; raise ConfigurationError for another name or no unit."""
+    known = {offer.name: offer for offer in offers}
+    for name, unit in units.items():
+        _offer_named(name, known)
+        if not is_unit(unit):
+            raise ConfigurationError(f"--unit {name}={unit}: {unit!r} is no unit: write it like V, 1/min or N*m")
+    return [replace(offer, unit=units.get(offer.name, offer.unit)) for offer in offers]
+
+
+def _offer_named(name: str, known: Mapping[str, Offer]) -> Offer:
+    if name not in known:
+        raise ConfigurationError(f"the source has no signal {name!r}: {nearest(name, list(known))}")
+    return known[name]
+
+
+def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
+    echo(source.title)
+    rows = []
+    for offer in offers[:MAX_SHOWN]:
+        ends = [f"{end:.4g}" for end in (offer.values.min(), offer.values.max())] if len(offer.values) else ["", ""]
+        every = "" if offer.interval is None else duration_text(offer.interval)
+        moves = "yes" if offer.moves else "·no"
+        rows.append({"signal": offer.name, "unit": offer.unit or "?", "least": ends[0], "most": ends[1],
+                     "every": every, "moves": moves})  # fmt: skip
+    console = stdout_console()
+    for table in fitted_tables(("signal",), rows, console.width):
+        console.print(table)
+    if len(offers) > MAX_SHOWN:
+        echo(f"and {len(offers) - MAX_SHOWN} more")
+    echo(*(f"! {remark}" for remark in source.remarks), "")
+
+
+def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, questions: Questions) -> TwinProposal:
+    """Return the twin that fits best, or the one that was told; raise ConfigurationError if none fits."""
+    ranked = rank([find_twin(name) for name in library_twins()], offers, source.title)
+    fitting = [row for row in ranked if row.fits]
+    if len(fitting) > 1:
+        echo(f"twins that fit: {', '.join(row.twin.name for row in fitting)}")
+    name = questions.text("Twin", answers.twin or ranked[0].twin.name, lambda text: find_twin(text).name)
+    twin, known = find_twin(name), {offer.name: offer for offer in offers}
+    for signal in [*answers.signals, *answers.unknown]:
+        if signal not in twin.signals:
+            raise ConfigurationError(f"twin {name} has no signal {signal!r}: it has {', '.join(twin.signals)}")
+    given = {signal: _offer_named(text, known) for signal, text in answers.signals.items()}
+    for signal, offer in given.items():
+        _check_unit(twin, signal, offer, offer.unit or twin.unit_of(signal))
+    proposal = propose(twin, offers, given, answers.unknown)
+    echo(f"twin {name}: {twin.title}")
+    if not (proposal.fits or questions.asks):
+        lacking = "; ".join(f"{row} ({meaning_of(twin, row)}, {twin.unit_of(row)})" for row in proposal.missing)
+        remedy = "--signal SIGNAL=NAME tells which signal it is, --unit NAME=UNIT its unit, --twin another twin"
+        raise ConfigurationError(f"twin {name} needs what nothing offers: {lacking}: {remedy}")
+    return proposal
+
+
+def _signals(
+    proposal: TwinProposal, offers: Sequence[Offer], answers: Answers, questions: Questions
+) -> tuple[dict[str, ReadSignal], dict[str, str]]:
+    """Return the signals that the source has, and the inputs that nothing measures with what is assumed of them."""
+    known = {offer.name: offer for offer in offers}
+    twin, read, assumed = proposal.twin, dict[str, ReadSignal](), dict[str, str]()
+    for name in dict.fromkeys(twin.signals):
+        what = f"{name} [{twin.unit_of(name)}], {meaning_of(twin, name)}"
+        pair = proposal.pairs.get(name)
+        is_input = any(row.name == name for row in twin.inputs)
+        if questions.asks:
+            proposed = pair.offer.name if pair else answers.unknown.get(name, "constant" if is_input else "")
+            allowed = ASSUMPTIONS if is_input else ()
+            hint = " (or constant, slow, friction without a sensor)" if is_input else ""
+            text = questions.text(f"{what}: which signal{hint}?", proposed, _one_of(known, allowed))
+        else:
+            text = pair.offer.name if pair else answers.unknown.get(name, "constant")
+        if text not in known:
+            assumed[name] = text
+            echo(f"  {what}: no sensor, taken as {text}")
+            continue
+        why = pair.why if pair and pair.offer.name == text else "as told"
+        others = proposal.others.get(name, ()) if pair and pair.offer.name == text else ()
+        read[name] = _read(twin, name, known[text], why, answers, questions)
+        echo(f"  {what}: {text} [{read[name].unit}], {read[name].remark}")
+        if others:
+            echo(f"  ! {', '.join(others)} would be as likely: --signal {name}=NAME decides")
+    return read, assumed
+
+
+def _one_of(known: Mapping[str, Offer], allowed: Sequence[str]) -> Callable[[str], str]:
+    def check(text: str) -> str:
+        if text not in known and text not in allowed:
+            raise ValueError(f"{text!r} is no signal of the source: {nearest(text, list(known))}")
+        return text
+
+    return check
+
+
+def _read(twin: Definition, name: str, offer: Offer, why: str, answers: Answers, questions: Questions) -> ReadSignal:
+    """Return a signal with its unit; raise ConfigurationError if it is of another quantity, or the scale no number."""
+    target = twin.unit_of(name)
+
+    def fitting(unit: str) -> str:
+        factor(unit, target)
+        return unit
+
+    unit = offer.unit
+    if unit is None:
+        unit = questions.text(f"Unit of {offer.name}", target, fitting)
+        if not questions.asks:
+            why = f"{why}; the unit is assumed, --unit {offer.name}=UNIT states it".removeprefix("; ")
+    _check_unit(twin, name, offer, unit)
+    scale = {"scale": number_of(answers.scales[offer.name])} if offer.name in answers.scales else {}
+    return ReadSignal(offer, unit, why, scale)
+
+
+def _check_unit(twin: Definition, name: str, offer: Offer, unit: str) -> None:
+    try:
+        factor(unit, twin.unit_of(name))
+    except ValueError as error:
+        raise ConfigurationError(f"{name} from {offer.name}: {error}") from error
+
+
+def number_of(text: str) -> float:
+    """Return the number that a scale is; raise ConfigurationError for another text."""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ConfigurationError(f"--scale {text!r}: no number") from error
+
+
+def _seconds(text: str) -> str:
+    return f"{Quantity('s', 1e-4, 600.0)(text):.9g} s"
+
+
+def _write_checked(file: Path, text: str) -> None:
+    """Write ``text`` into ``file`` if the daemon accepts it, at once and whole; else raise ConfigurationError."""
+    try:
+        handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
+    except OSError as error:
+        raise ServiceError(f"{file}: cannot be written: {error.strerror}") from error
+    made = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        try:
+            load_machine(made)
+        except ConfigurationError as error:
+            raise ConfigurationError(str(error).replace(str(made), str(file))) from error
+        made.chmod(0o644)
+        made.replace(file)
+    finally:
+        made.unlink(missing_ok=True)
