@@ -15,7 +15,9 @@ import click
 
 from otolith import __version__
 from otolith.cli.commissioning.components import baseline, commission, components, reset
+from otolith.cli.commissioning.config import config
 from otolith.cli.commissioning.draft.command import init
+from otolith.cli.commissioning.drivers import drivers
 from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
 from otolith.cli.commissioning.twin import twin
@@ -353,6 +355,8 @@ COMMANDS: tuple[click.Command, ...] = (
     baseline,
     commission,
     components,
+    config,
+    drivers,
     history,
     init,
     install,

@@ -1,0 +1,71 @@
+"""``otolith config show`` and ``otolith drivers``: complete, and as right as the files that they come from."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from otolith.cli.main import cli
+from otolith.machine import LoadedMachine, load_machine
+from otolith_drivers import base
+from otolith_drivers.errors import ConfigurationError
+from tests.conftest import EXAMPLES
+
+FILES = sorted(EXAMPLES.glob("*.toml"))
+DEFAULT = re.compile(r"^# (?=[^\n]+ = )", re.MULTILINE)
+
+
+def otolith(*arguments: object) -> str:
+    result = CliRunner().invoke(cli, list(map(str, arguments)), standalone_mode=False, catch_exceptions=False)
+    return result.output
+
+
+def meaning(machine: LoadedMachine) -> tuple[object, ...]:
+    """All that the daemon does by a file."""
+    file = machine.file
+    rest = (file.machine, file.window, file.zenoh, file.recording, file.history, file.evidence, file.swarm)
+    return (machine.problem, machine.plan, machine.signal_tables, machine.driver.describe(), *rest)
+
+
+@pytest.mark.parametrize("example", FILES, ids=lambda path: path.stem)
+def test_the_shown_file_means_the_same_with_and_without_its_defaults(example: Path, tmp_path: Path) -> None:
+    for path in EXAMPLES.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    shown = otolith("config", "show", example)
+    bare, whole = tmp_path / "bare.toml", tmp_path / "whole.toml"
+    bare.write_text(shown, encoding="utf-8")
+    whole.write_text(DEFAULT.sub("", shown), encoding="utf-8")
+    assert len(DEFAULT.findall(shown)) > 50
+    expected = meaning(load_machine(tmp_path / example.name))
+    assert meaning(load_machine(bare)) == expected
+    assert meaning(load_machine(whole)) == expected
+
+
+def test_values_are_shown_with_their_units() -> None:
+    shown = otolith("config", "show", EXAMPLES / "dc-motor.toml").splitlines()
+    assert '# jitter_limit = "0.005 s"' in shown
+    assert "L_a" not in shown
+    assert 'value = "0.673 H"' in shown
+    assert any(line.startswith("##") and "MotorElectrical.ArmatureVoltage" in line for line in shown)
+
+
+def test_every_driver_is_listed_with_its_keys() -> None:
+    document = json.loads(otolith("drivers", "--json"))
+    assert set(document) == set(base.known_drivers())
+    for name, row in document.items():
+        module = base.find_driver(name)
+        assert row["usable"]
+        for table, model in (("driver", module.Options), ("signals", module.Source)):
+            assert list(row[table]) == [field.alias or key for key, field in model.model_fields.items()]
+    assert document["modbus"]["driver"]["timeout"].endswith('s"')
+
+
+def test_a_driver_without_its_extra_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(base.DRIVERS, "opcua", "otolith_drivers.no_such_library")  # as if asyncua were missing
+    row = json.loads(otolith("drivers", "--json"))["opcua"]
+    assert not row["usable"]
+    assert "otolith[opcua]" in row["reason"]
+    with pytest.raises(ConfigurationError, match=r"otolith\[opcua\]"):
+        otolith("drivers", "opcua")
