@@ -260,8 +260,13 @@ Options, Source = MqttOptions, MqttSource  # for base.DriverType
 
 def build(options: MqttOptions, setup: Setup) -> "MqttListener":
     """Return a listener to all signals; raise ConfigurationError for a wrong unit, certificate, key or password."""
+    return listener(options, setup, Messages(options, setup.signals))
+
+
+def listener(options: MqttOptions, setup: Setup, messages: Messages) -> "MqttListener":
+    """Return a listener whose messages go to ``messages``; raise ConfigurationError for a wrong file."""
     secret = None if options.password_file is None else setup.folder / options.password_file
-    return MqttListener(options, Messages(options, setup.signals), password(secret), _tls(options, setup.folder))
+    return MqttListener(options, messages, password(secret), _tls(options, setup.folder))
 
 
 def _tls(options: MqttOptions, folder: Path) -> ssl.SSLContext | None:

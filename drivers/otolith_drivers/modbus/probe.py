@@ -453,19 +453,27 @@ def modbus_signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
         layout, part = number.part.layout, number.part
         if layout is None or part.verdict is LayoutVerdict.ERRATIC:
             continue
-        order = f', order = "{layout.order}"' if layout.width > 2 or layout.order != "ABCD" else ""
-        table = f', table = "{place.table}"' if place.table != "holding" else ""
-        register = f"register = {place.shown(number.address)}{table}"
+        keys = ", ".join(
+            f"{key} = {toml_value(value)}" for key, value in number_keys(place, number.address, layout).items()
+        )
         longer = _longer_readings(place, number, numbers)
         mark = "? " if longer or part.verdict is LayoutVerdict.LIKELY else ""
         comment = f"{mark}{spread(part)}{_alternatives(place, number)}{longer}"
-        lines.append(f'NAME = {{ {register}, type = "{layout.kind}"{order}, unit = "?" }}  {toml_comment(comment)}')
+        lines.append(f'NAME = {{ {keys}, unit = "?" }}  {toml_comment(comment)}')
     for verdict, remark in REMARKS.items():
         unknown = [number for number in numbers if number.part.verdict is verdict]
         if unknown:
             addresses = [number.address + offset for number in unknown for offset in range(number.count)]
             lines.append(f"# {spans(map(place.shown, addresses))}: {remark}")
     return lines
+
+
+def number_keys(place: Place, address: int, layout: Layout) -> dict[str, int | str]:
+    """Return the keys by which a machine file names a number at ``address`` (on the wire), without its unit."""
+    keys: dict[str, int | str] = {"register": place.shown(address)}
+    keys |= {"table": place.table} if place.table != "holding" else {}
+    keys |= {"type": layout.kind}
+    return keys | ({"order": layout.order} if layout.width > 2 or layout.order != "ABCD" else {})
 
 
 def _longer_readings(place: Place, number: Number, numbers: Sequence[Number]) -> str:

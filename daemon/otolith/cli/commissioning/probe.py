@@ -127,7 +127,7 @@ def modbus(
     if first < first_address:
         raise click.BadParameter("with --first-address 1 there is no register 0", param_hint="--registers")
     keys = {"framing": framing, "baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}
-    keys |= _address(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s"}
+    keys |= address_keys(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s"}
     devices = device or (DEVICES if scan else (1, 1))
     place = Place(validated(keys, LineOptions, ()), devices[0], "holding" if table == "holding" else "input",
                   first_address)  # fmt: skip
@@ -140,7 +140,7 @@ def modbus(
         else:
             echo(*_scan_lines(place, devices, answers))
         return stop.code() or (0 if answers else NOTHING_THERE)
-    probed = _read(place, (first - first_address, last - first_address), seconds, stop)
+    probed = read_registers(place, (first - first_address, last - first_address), seconds, stop)
     if as_json:
         echo_json(modbus_document(probed))
     else:
@@ -148,7 +148,7 @@ def modbus(
     return stop.code() or (0 if probed.survey.blocks else NOTHING_THERE)
 
 
-def _address(target: str) -> dict[str, Any]:
+def address_keys(target: str) -> dict[str, Any]:
     """Host and port, or serial port, as keys of the machine file."""
     if target.startswith(("/", "COM")):
         return {"serial": target}
@@ -184,7 +184,7 @@ def _scan_lines(place: "Place", devices: Span, answers: "list[Answer]") -> Itera
         yield "is it the right host, or is it a gateway with framing = rtu?"
 
 
-def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> "DeviceProbe":
+def read_registers(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> "DeviceProbe":
     """What the registers at ``addresses`` (on the wire) hold for ``seconds``; raise DeviceError without an answer."""
     from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.modbus.options import HIGHEST_ADDRESS
@@ -361,7 +361,7 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     given = {name: value for name, value in keys.items() if value is not None}
     options = validated({"endpoint": endpoint, "timeout": f"{timeout} s"} | given, OpcuaOptions, ())
     with progress_line(f"reading {endpoint}"):
-        variables = asyncio.run(_browse(options, most))
+        variables = asyncio.run(browse_server(options, most))
     if as_json:
         echo_json({"variables": [_opcua_document(one) for one in variables]})
     else:
@@ -373,12 +373,15 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     return 0 if variables else NOTHING_THERE
 
 
-async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
-    """Return the variables of the server; raise DeviceError if it cannot be read."""
+async def browse_server(options: "OpcuaOptions", most: int, folder: Path = Path()) -> "list[Variable]":
+    """Return the variables of the server; raise DeviceError if it cannot be read.
+
+    Files of ``options`` are relative to ``folder``.
+    """
     from otolith_drivers.errors import DeviceError
     from otolith_drivers.opcua.connection import OpcUaCredentials, browse, connected, reason
 
-    credentials = OpcUaCredentials.load(options, Path())
+    credentials = OpcUaCredentials.load(options, folder)
     try:
         async with connected(options, credentials) as (client, _):
             return await browse(client, most)

@@ -1,19 +1,21 @@
 """``otolith init``: from nothing to a machine file that ``otolith check`` accepts."""
 
 import sys
-from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from otolith.cli.commissioning.draft.questions import Questions
+from otolith.cli.commissioning.probe import MAX_REGISTERS, Range
 from otolith.cli.common import FILE, StopSignal
 from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
     from otolith.cli.commissioning.draft.offers import OfferedSource
 
+SOURCES = ("csv", "dbc", "modbus", "opcua", "mqtt")
 ASSUMPTIONS = ("constant", "slow", "friction")
 
 
@@ -40,12 +42,20 @@ def _assumptions(context: click.Context, option: click.Parameter, written: tuple
 @click.argument("file", type=FILE)
 @click.option("--csv", type=FILE, help="A table with recorded data.")
 @click.option("--dbc", type=FILE, help="The database of a CAN bus; with --log, else the bus is listened to.")
+@click.option("--modbus", metavar="HOST[:PORT]|/dev/ttyUSB0", help="A Modbus device.")
+@click.option("--opcua", metavar="ENDPOINT", help="An OPC UA server.")
+@click.option("--mqtt", metavar="HOST[:PORT]", help="An MQTT broker.")
 @click.option("--log", type=FILE, help="A log of the CAN bus, as candump -L writes it, .blf, .asc, .trc, .mf4.")
 @click.option("--interface", default="auto", help="Of python-can: socketcan, pcan, kvaser, slcan ...")
 @click.option("--channel", help="As 'ip link' or python-can names it.  [default: vcan0]")
 @click.option("--port", type=click.IntRange(1024, 65535), default=43113, help="Of udp_multicast.")
 @click.option("--bitrate", type=click.IntRange(1000, 1_000_000), help="For interfaces that set it themselves.")
-@click.option("--seconds", type=click.FloatRange(0.1, 3600.0), default=5.0, help="How long to listen to a bus.")
+@click.option("--registers", type=Range(0, 65536, MAX_REGISTERS), help="Of Modbus.  [default: the first 64]")
+@click.option("--table", type=click.Choice(["holding", "input"]), default="holding", help="Of Modbus.")
+@click.option("--topics", default="#", help="Of MQTT; '#' and '+' stand for any.")
+@click.option("--driver", "keys", multiple=True, callback=_pairs, metavar="KEY=VALUE",
+              help="Another key of [driver], of Modbus, OPC UA or MQTT: device=5, user=otolith.")  # fmt: skip
+@click.option("--seconds", type=click.FloatRange(0.1, 3600.0), default=5.0, help="How long to listen or read.")
 @click.option("--twin", help="A twin of the library.  [default: the one that fits best]")
 @click.option("--signal", "signals", multiple=True, callback=_pairs, metavar="SIGNAL=NAME",
               help="Which signal of the source an input or output of the twin is.")  # fmt: skip
@@ -56,27 +66,14 @@ def _assumptions(context: click.Context, option: click.Parameter, written: tuple
 @click.option("--scale", "scales", multiple=True, callback=_pairs, metavar="NAME=FACTOR",
               help="What one step of a number is worth in its unit; not for --csv.")  # fmt: skip
 @click.option("--noise", "noises", multiple=True, callback=_pairs, metavar="SIGNAL=LEVEL",
-              help="Standard deviation of a sensor, as \"i=5 mA\".")  # fmt: skip
+              help='Standard deviation of a sensor, as "i=5 mA".')  # fmt: skip
 @click.option("--name", help="Of the machine.  [default: that of FILE]")
 @click.option("--site", help="Where the machine is.")
 @click.option("--sample-period", help='As "10 ms".  [default: that of the fastest signal]')
 @click.option("--window", help='Length of a window, as "2 s".  [default: 200 sample periods]')
 @click.option("--ask/--no-ask", default=None, help="Ask for each answer.  [default: if input is a terminal]")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
-def init(
-    file: Path,
-    csv: Path | None,
-    dbc: Path | None,
-    log: Path | None,
-    interface: str,
-    channel: str | None,
-    port: int,
-    bitrate: int | None,
-    seconds: float,
-    ask: bool | None,
-    force: bool,
-    **answers: Any,
-) -> None:
+def init(file: Path, ask: bool | None, force: bool, **options: Any) -> None:
     """Write a first machine file FILE from recorded data or a bus.
 
     It shows which signals there are and which of them move, proposes a twin and which signal is which of its inputs
@@ -89,6 +86,8 @@ def init(
       otolith init drive.toml --csv montag.csv --unit Drehzahl=1/min
       otolith init drive.toml --dbc drive.dbc --log monday.log
       otolith init drive.toml --dbc drive.dbc --channel can0
+      otolith init drive.toml --modbus 192.168.0.10 --ask
+      otolith init drive.toml --opcua opc.tcp://plc:4840 --driver user=otolith
     """
     from otolith.cli.commissioning.draft.choosing import Answers, write_draft
 
@@ -98,42 +97,51 @@ def init(
         text = f"{str(file)!r} exists: choose another name, or overwrite it by --force"
         raise click.BadParameter(text, param_hint="FILE")
     questions = Questions(asks=sys.stdin.isatty() if ask is None else ask)
-    if csv is None and dbc is None:
-        csv, dbc = _asked_source(questions)
-    if csv is not None and dbc is not None:
-        raise click.UsageError("--csv and --dbc: one source at a time; --log is the log of a bus")
-    if log is not None and dbc is None:
+    answers = Answers(**{name.name: options.pop(name.name) for name in fields(Answers)})
+    given = [name for name in SOURCES if options[name] is not None]
+    if len(given) > 1:
+        raise click.UsageError(f"--{' and --'.join(given)}: one source at a time; --log is the log of a bus")
+    kind = given[0] if given else questions.choice("What is the source?", list(SOURCES))
+    if kind is None:
+        raise click.UsageError(
+            "what is the source? --csv, --dbc (with --log or --channel), --modbus, --opcua or --mqtt"
+        )
+    target = str(options[kind] if given else click.prompt("its file or address"))
+    if options["log"] is not None and kind != "dbc":
         raise click.UsageError("--log needs --dbc, the database of its frames")
-    stop, folder = StopSignal(), file.parent
-    if csv is not None:
+    write_draft(file, _source(kind, target, options, file.parent), answers, questions)
+
+
+def _source(kind: str, target: str, options: dict[str, Any], folder: Path) -> "OfferedSource":
+    """Return what the source of that kind offers; each kind imports only what it needs."""
+    stop, seconds, log = StopSignal(), options["seconds"], options["log"]
+    if kind == "csv":
         from otolith.cli.commissioning.draft.recorded import table_offers
 
-        source = table_offers(csv, folder)
-    else:
-        rate = {} if bitrate is None else {"bitrate": f"{bitrate} bit/s"}
-        bus = {"interface": interface, "channel": channel, "port": port} | rate
-        source = _can_source(Path(dbc or ""), log, bus, seconds, folder, stop)
-    write_draft(file, source, Answers(**answers), questions)
+        return table_offers(Path(target), folder)
+    if log is None:
+        echo(f"for {seconds:g} s: let the machine move")
+    if kind == "dbc":
+        return _can_source(Path(target), options, folder, stop)
+    from otolith.cli.commissioning.draft import network
+
+    keys = network.driver_keys(options["keys"])
+    if kind == "modbus":
+        return network.device_offers(target, options["registers"], options["table"], keys, seconds, stop)
+    if kind == "opcua":
+        return network.server_offers(target, keys, seconds, folder, stop)
+    return network.broker_offers(target, options["topics"], keys, seconds, folder, stop)
 
 
-def _asked_source(questions: Questions) -> tuple[Path | None, Path | None]:
-    """Return the table or the database that is asked for; raise UsageError where nobody is asked."""
-    kind = questions.choice("A table of recorded data, or a CAN bus with its database?", ["csv", "dbc"])
-    if kind is None:
-        raise click.UsageError("what is the source? --csv FILE, or --dbc FILE with --log FILE or --channel NAME")
-    path = Path(click.prompt("its file", type=FILE))
-    return (path, None) if kind == "csv" else (None, path)
-
-
-def _can_source(
-    database: Path, log: Path | None, keys: Mapping[str, Any], seconds: float, folder: Path, stop: StopSignal
-) -> "OfferedSource":
+def _can_source(database: Path, options: dict[str, Any], folder: Path, stop: StopSignal) -> "OfferedSource":
     from otolith.cli.commissioning.draft.bus import bus_offers, log_offers
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.config_files import validated
 
-    options = validated(dict(keys), BusOptions, ())
-    if log is not None:
-        return log_offers(log, database, options, folder)
-    echo(f"listening for {seconds:g} s: let the machine move")
-    return bus_offers(database, options, seconds, folder, stop)
+    keys = {name: options[name] for name in ("interface", "channel", "port")}
+    if options["bitrate"] is not None:
+        keys["bitrate"] = f"{options['bitrate']} bit/s"
+    bus = validated(keys, BusOptions, ())
+    if options["log"] is not None:
+        return log_offers(options["log"], database, bus, folder)
+    return bus_offers(database, bus, options["seconds"], folder, stop)

@@ -1,0 +1,149 @@
+"""What a Modbus device, an OPC UA server and an MQTT broker offer. All are only read."""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from otolith.cli.commissioning.draft.offers import Offer, OfferedSource, unit_in
+from otolith.cli.commissioning.probe import address_keys, browse_server, read_registers
+from otolith.cli.common import StopSignal, progress_line
+from otolith_drivers.base import find_driver
+from otolith_drivers.config_files import validated
+from otolith_drivers.errors import ConfigurationError, DeviceError, counted
+from otolith_drivers.grammars.toml_lines import toml_key, toml_value
+from otolith_drivers.units import is_unit
+
+MAX_VARIABLES = 500  # of a server that are read
+READINGS = 4  # of an OPC UA server in the time of listening
+ADDRESSING = ("device", "first_address")  # keys of [driver] beside those of the line
+
+
+def device_offers(
+    target: str,
+    registers: tuple[int, int] | None,
+    table: str,
+    keys: Mapping[str, Any],
+    seconds: float,
+    stop: StopSignal,
+) -> OfferedSource:
+    """Return the numbers that change in the registers of a device; raise DeviceError if it does not answer."""
+    from otolith_drivers.modbus.options import LineOptions
+    from otolith_drivers.modbus.probe import Place, modbus_driver_lines, number_keys, possible_rate
+
+    line = {name: value for name, value in keys.items() if name not in ADDRESSING}
+    options = validated(address_keys(target) | line, LineOptions, ())
+    device, base = (_whole(keys, name, default) for name, default in zip(ADDRESSING, (1, 0), strict=True))
+    place = Place(options, device, "holding" if table == "holding" else "input", base)
+    first, last = registers or (base, base + 63)
+    if first < base:
+        raise ConfigurationError(f"--registers: with first_address = {base} there is no register {first}")
+    probed = read_registers(place, (first - base, last - base), seconds, stop)
+    rate = possible_rate(probed.speeds)
+    offers = [
+        Offer(
+            str(place.shown(number.address)),
+            None,
+            number_keys(place, number.address, number.part.layout),
+            number.part.numbers[np.isfinite(number.part.numbers)],
+            1.0 / rate if rate else None,
+        )
+        for number in probed.requested
+        if number.part.layout is not None
+    ]
+    if not offers:
+        raise DeviceError(
+            f"{options.title()}: no register changes: let the machine move, or choose others by --registers"
+        )
+    lines = modbus_driver_lines(place, probed.survey)
+    lines += [
+        row for row in _rows(keys) if row.partition(" = ")[0] not in {known.partition(" = ")[0] for known in lines}
+    ]
+    title = f"{options.title()}, device {device}: {counted(len(offers), 'number')} that change"
+    remark = (
+        "registers have neither names nor units: --signal SIGNAL=REGISTER, --unit REGISTER=UNIT and --scale say them"
+    )
+    return OfferedSource(title, lines, offers, 0.0, remarks=[remark])
+
+
+def server_offers(
+    endpoint: str, keys: Mapping[str, Any], seconds: float, folder: Path, stop: StopSignal
+) -> OfferedSource:
+    """Return the numbers of an OPC UA server; raise DeviceError if it cannot be read."""
+    find_driver("opcua")  # names the extra that is missing
+    from otolith_drivers.opcua.connection import OpcuaOptions
+
+    options = validated({"endpoint": endpoint} | dict(keys), OpcuaOptions, ())
+    values: dict[str, list[float]] = {}
+    with progress_line(f"reading {endpoint}") as show:
+        for reading in range(READINGS):
+            if reading:
+                time.sleep(seconds / READINGS)
+            variables = asyncio.run(browse_server(options, MAX_VARIABLES, folder))
+            for variable in variables:
+                if isinstance(variable.value, int | float) and not isinstance(variable.value, bool):
+                    values.setdefault(variable.node, []).append(float(variable.value))
+            show(f"reading {endpoint}: {reading + 1} of {READINGS}")
+            if stop.received():
+                break
+    numbers = [variable for variable in variables if variable.node in values]
+    if not numbers:
+        raise DeviceError(f"OPC UA {endpoint}: no variable with a number; 'otolith probe opcua' shows what there is")
+    names = Counter(variable.path.rpartition("/")[2] for variable in numbers)
+    offers = []
+    for variable in numbers:
+        short = variable.path.rpartition("/")[2]
+        series = np.array(values[variable.node])
+        unit = variable.unit if variable.unit and is_unit(variable.unit) else unit_in(short)
+        name = short if names[short] == 1 else variable.path
+        offers.append(Offer(name, unit, {"node": variable.node}, series[np.isfinite(series)], options.interval))
+    lines = ["[driver]", 'type = "opcua"', f"endpoint = {toml_value(endpoint)}", *_rows(keys)]
+    return OfferedSource(f"OPC UA {endpoint}: {counted(len(offers), 'number')}", lines, offers, 0.0)
+
+
+def broker_offers(
+    target: str, topics: str, keys: Mapping[str, Any], seconds: float, folder: Path, stop: StopSignal
+) -> OfferedSource:
+    """Return the numbers in the messages of a broker; raise DeviceError if there is none, or it sends no number."""
+    module = find_driver("mqtt")  # names the extra that is missing
+    from otolith_drivers.mqtt_probe import observe
+
+    host, _, port = target.rpartition(":") if target.rpartition(":")[2].isdecimal() else (target, "", "")
+    place: dict[str, Any] = {"host": host} | ({"port": int(port)} if port else {})
+    options: Any = validated(place | dict(keys), module.Options, ())
+    with progress_line(f"listening to {target}"):
+        messages = observe(options, folder, seconds, stop.received, topics)
+    offers = []
+    for number in messages.numbers.values():
+        name = number.topic if number.path is None else f"{number.topic} {number.path}"
+        source = {"topic": number.topic} | ({} if number.path is None else {"field": number.path})
+        steps = np.diff(number.times)
+        interval = float(np.median(steps)) if len(steps) and np.median(steps) > 0.0 else None
+        series = np.array(number.values)
+        offers.append(Offer(name, unit_in(name), source, series[np.isfinite(series)], interval))
+    if not offers:
+        raise DeviceError(f"{options.title()}: no message with a number in {seconds:g} s in topics {topics}")
+    lines = ["[driver]", 'type = "mqtt"', *_rows(place), *_rows(keys)]
+    left = [f"{counted(messages.left_out, 'number')} of further topics left out"] if messages.left_out else []
+    return OfferedSource(f"{options.title()}: {counted(len(offers), 'number')}", lines, offers, 0.0, remarks=left)
+
+
+def _rows(keys: Mapping[str, Any]) -> list[str]:
+    return [f"{toml_key(name)} = {toml_value(value)}" for name, value in keys.items()]
+
+
+def _whole(keys: Mapping[str, Any], name: str, default: int) -> int:
+    value = keys.get(name, default)
+    if not isinstance(value, int):
+        raise ConfigurationError(f"--driver {name}={value}: write a whole number")
+    return value
+
+
+def driver_keys(written: Mapping[str, str]) -> dict[str, Any]:
+    """Return keys of ``[driver]`` with what their texts mean: a whole number, true, false, else the text."""
+    words: Mapping[str, Any] = {"true": True, "false": False}
+    return {name: int(text) if text.isdecimal() else words.get(text, text) for name, text in written.items()}

@@ -1,0 +1,139 @@
+"""``otolith init`` from a Modbus device, an OPC UA server and an MQTT broker, each a real one."""
+
+import json
+import math
+import socket
+import threading
+import tomllib
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith.machine import load_machine
+from otolith_drivers.errors import ConfigurationError, DeviceError
+from otolith_drivers.mqtt import MqttOptions
+from otolith_drivers.mqtt_probe import ObservedMessages
+from tests.conftest import free_port
+from tests.drivers.modbus_servers import Words, library_server
+from tests.drivers.mqtt_broker import broker_of_this_process, publisher
+from tests.drivers.opcua_server import opcua_server
+from tests.drivers.registers import registers
+from tests.messages import raises_saying
+
+
+def otolith(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, list(map(str, arguments)), standalone_mode=False, catch_exceptions=False)
+
+
+def tables(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def drive() -> Iterator[int]:
+    """A drive with voltage (V), current (A) and speed (0.1 rpm) in three registers of 16 bits; the port."""
+    moments = count(0.0, 0.02)
+
+    def moving() -> Words:
+        time = next(moments)
+        numbers = (24.0 + 3.0 * math.sin(time), 300.0 * math.sin(2.0 * time), 9000.0 * math.sin(time))
+        return {10 + at: registers(round(number), "int16", "ABCD")[0] for at, number in enumerate(numbers)}
+
+    with library_server(moving(), lambda _: moving()) as port:
+        yield port
+
+
+def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tmp_path: Path) -> None:
+    file, target = tmp_path / "drive.toml", f"127.0.0.1:{drive}"
+    told = ["--signal", "V_a=10", "--signal", "i=11", "--signal", "omega=12", "--unit", "10=V", "--unit", "11=mA",
+            "--unit", "12=rpm", "--scale", "12=0.1", "--twin", "dc_motor"]  # fmt: skip
+    otolith("init", file, "--modbus", target, "--registers", "10..12", "--seconds", 1.5, *told)
+    assert tables(file)["driver"]["host"] == "127.0.0.1"
+    assert tables(file)["signals"]["omega"] == {"register": 12, "type": "int16", "unit": "rpm", "scale": 0.1}
+    assert tables(file)["signals"]["T_load"] == {"unknown": "constant"}
+    assert otolith("check", file).return_value == 0
+    with raises_saying(ConfigurationError, "--signal", "--unit"):
+        otolith("init", tmp_path / "other.toml", "--modbus", target, "--registers", "10..12", "--seconds", 1.5)
+
+
+def test_variables_of_a_server_find_the_twin(tmp_path: Path) -> None:
+    variables = {"ArmatureVoltage": (12.0, "V"), "ArmatureCurrent": (0.5, "A"), "RotorSpeed": (900.0, "rpm"),
+                 "CabinetTemperature": (30.0, "°C")}  # fmt: skip
+    port, file = free_port(socket.SOCK_STREAM), tmp_path / "plc.toml"
+    with opcua_server(port, variables):
+        otolith(
+            "init", file, "--opcua", f"opc.tcp://127.0.0.1:{port}/motor", "--seconds", 0.5, "--driver", "stamps=server"
+        )
+        assert otolith("check", file).return_value == 0
+    read = tables(file)
+    assert read["driver"]["stamps"] == "server"
+    assert {name: table.get("node") for name, table in read["signals"].items()} == {
+        "V_a": "nsu=urn:motor;s=ArmatureVoltage", "i": "nsu=urn:motor;s=ArmatureCurrent",
+        "omega": "nsu=urn:motor;s=RotorSpeed", "T_load": None,
+    }  # fmt: skip
+
+
+def test_messages_of_a_broker_find_the_twin(tmp_path: Path) -> None:
+    port, file, ended = broker_of_this_process(), tmp_path / "cell.toml", threading.Event()
+    with publisher(port) as client:
+
+        def publish() -> None:
+            for number in count():
+                if ended.wait(0.02):
+                    return
+                wave = math.sin(0.05 * number)
+                client.publish("cell/drive", json.dumps({"armature": {"voltage_V": 12.0 + wave, "current_A": wave}}))
+                client.publish("cell/speed_rpm", f"{900.0 + 100.0 * wave:.3f}")
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            otolith("init", file, "--mqtt", f"127.0.0.1:{port}", "--topics", "cell/#", "--seconds", 2)
+            assert otolith("check", file).return_value == 0
+        finally:
+            ended.set()
+            thread.join()
+    signals = tables(file)["signals"]
+    assert signals["V_a"] == {"topic": "cell/drive", "field": "armature.voltage_V", "unit": "V"}
+    assert signals["omega"] == {"topic": "cell/speed_rpm", "unit": "rpm"}
+    load_machine(file)
+
+
+def test_a_source_that_is_not_there_leaves_no_file(tmp_path: Path) -> None:
+    for kind, target in (
+        ("--modbus", "127.0.0.1:{}"),
+        ("--opcua", "opc.tcp://127.0.0.1:{}"),
+        ("--mqtt", "127.0.0.1:{}"),
+    ):
+        port = free_port(socket.SOCK_STREAM)
+        with pytest.raises(DeviceError, match=str(port)):
+            otolith("init", tmp_path / "new.toml", kind, target.format(port), "--seconds", 0.3)
+    assert list(tmp_path.glob("*.toml")) == []
+
+
+def test_messages_of_any_kind_are_bounded_and_give_no_number_that_a_field_cannot_name() -> None:
+    messages = ObservedMessages(MqttOptions(host="broker"))
+    deep = "[" * 100_000
+    payloads = [
+        b"\xff\xfe",
+        b"",
+        deep.encode(),
+        b'{"a": {"b.c": 1, "b": {"c": 2}}}',
+        b"[1, true, null]",
+        b"NaN",
+        b"1e999",
+    ]
+    for number, payload in enumerate(payloads):
+        messages.take(f"topic/{number}", payload, float(number), retained=False)
+    messages.take("old", b"5", 9.0, retained=True)
+    for number in range(3000):
+        messages.take(f"many/{number}", b"1", 10.0, retained=False)
+    assert len(messages.numbers) == 2000
+    assert messages.left_out > 0
+    assert ("old", None) not in messages.numbers
+    assert messages.numbers["topic/4", "[0]"].values == [1.0]
