@@ -57,7 +57,7 @@ class TwinProposal:
 def rank(twins: Sequence[Definition], offers: Sequence[Offer], hint: str = "") -> list[TwinProposal]:
     """Return a proposal for each twin, the best first; ``hint`` is a text that may name the kind of machine."""
     proposals = [propose(twin, offers, hint=hint) for twin in twins]
-    return sorted(proposals, key=lambda row: (not row.fits, len(row.missing), -row.points, _estimated(row.twin)))
+    return sorted(proposals, key=lambda row: (not row.fits, -row.points, len(row.missing), _estimated(row.twin)))
 
 
 def propose(
@@ -108,7 +108,7 @@ def score(twin: Definition, signal: Input | Output, offer: Offer) -> tuple[float
     if offer.name.casefold() == signal.name.casefold():
         points += SAME_NAME
         why.append("name")
-    elif of_words := _of_words(offer.name, signal, offer.unit):
+    elif of_words := _of_words(twin, signal, offer):
         points += of_words
         why += ["name"] if of_words > 0.0 else []
     if len(offer.values):
@@ -116,16 +116,16 @@ def score(twin: Definition, signal: Input | Output, offer: Offer) -> tuple[float
     return points, " and ".join(why)
 
 
-def _of_words(name: str, signal: Input | Output, unit: str | None) -> float:
-    """Return the points of the words in the name of an offer."""
-    theirs, ours = meanings(name), meanings(f"{signal.name} {signal.meaning}")
+def _of_words(twin: Definition, signal: Input | Output, offer: Offer) -> float:
+    """Return the points of the words in the name of an offer; a word for the whole machine is no other qualifier."""
+    theirs, ours = meanings(offer.name), meanings(f"{signal.name} {signal.meaning}")
     quantities, qualifiers = set(QUANTITIES.values()), set(QUALIFIERS.values())
     points = 0.0
     if theirs & quantities:
         same = theirs & ours & quantities
-        points += SAME_QUANTITY if same else OTHER_QUANTITY if unit is None else 0.0
+        points += SAME_QUANTITY if same else OTHER_QUANTITY if offer.unit is None else 0.0
     points += SAME_QUALIFIER * len(theirs & ours & qualifiers)
-    foreign = (theirs & qualifiers) - ours
+    foreign = (theirs & qualifiers) - ours - meanings(twin.title)
     points += OTHER_QUALIFIER * len(foreign - {"setpoint", "supply"})
     is_command = isinstance(signal, Input) and signal.hold == "zoh"
     return points + SET_POINT * ("supply" in foreign) + SET_POINT * ("setpoint" in foreign and not is_command)

@@ -20,7 +20,7 @@ class Questions:
         The proposal may be text from outside, so that the escape of the terminal prints it.
         """
         while self.asks:
-            echo(f"{question}  [{proposed}]")
+            echo(f"{question}  [{proposed}]" if proposed else question)
             try:
                 return check(click.prompt(">", default=proposed, show_default=False, prompt_suffix=" "))
             except (ValueError, OtolithError) as error:
