@@ -68,3 +68,19 @@ def test_outside_of_the_block_nothing_is_broken_off(stop: StopSignal) -> None:
     with stop.ending():
         pass
     assert stop.received()
+
+
+def test_waiting_ends_soon_after_a_signal(stop: StopSignal) -> None:
+    signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    signal.setitimer(signal.ITIMER_REAL, 0.01)
+    begin = time.monotonic()
+    stop.wait(PATIENCE)
+    assert stop.received()
+    assert time.monotonic() - begin < PATIENCE
+
+
+def test_after_a_release_ctrl_c_ends_what_waits_for_a_person(stop: StopSignal) -> None:
+    stop.release()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+    assert not stop.received()

@@ -24,6 +24,7 @@ INSTALLED = Path("/etc/otolith")  # their machine files
 DEMOS = "demo"  # folder in the state directory with one for each demo, whose names sort by time
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
 STEP_TIMEOUT, BREAK_INTERVAL = 2.0, 0.5  # s until a step is broken off after a signal; until that is tried again
+PAUSE = 0.05  # s between two looks for a signal
 FILE = click.Path(path_type=Path, dir_okay=False)
 MACHINE_FILE = click.argument("file", type=FILE)
 DATA_FILE = click.argument("data", type=FILE)
@@ -68,9 +69,21 @@ class StopSignal:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP, and that stays so
                 signal.signal(number, self._receive)
 
+    def release(self) -> None:
+        """From now on a signal ends the command at once: one that waits for a person looks at no flag."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) == self._receive:
+                signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
     def received(self) -> bool:
         """Whether a signal has come."""
         return self._number is not None
+
+    def wait(self, seconds: float) -> None:
+        """Return after ``seconds``, or soon after a signal."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0 and not self.received():
+            time.sleep(min(left, PAUSE))
 
     def code(self, clean: int | None = None) -> int:
         """Exit code: 0 without a signal and for the signal ``clean``, else 128 plus the number of the signal."""

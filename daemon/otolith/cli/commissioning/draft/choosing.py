@@ -26,7 +26,7 @@ from otolith.machine import find_twin, library_twins, load_machine
 from otolith.machine_file import check_name
 from otolith.runtime.preview import duration_text
 from otolith.twin.definition import Definition
-from otolith_drivers.errors import ConfigurationError, ServiceError, nearest
+from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.outside_text import CONTROL
 from otolith_drivers.units import Quantity, factor, is_unit
 
@@ -220,10 +220,7 @@ def _seconds(text: str) -> str:
 
 def _write_checked(file: Path, text: str) -> None:
     """Write ``text`` into ``file`` if the daemon accepts it, at once and whole; else raise ConfigurationError."""
-    try:
-        handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
-    except OSError as error:
-        raise ServiceError(f"{file}: cannot be written: {error.strerror}") from error
+    handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
     made = Path(name)
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:

@@ -1,5 +1,6 @@
 """``otolith init``: from nothing to a machine file that ``otolith check`` accepts."""
 
+import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -73,7 +74,7 @@ def _assumptions(context: click.Context, option: click.Parameter, written: tuple
 @click.option("--window", help='Length of a window, as "2 s".  [default: 200 sample periods]')
 @click.option("--ask/--no-ask", default=None, help="Ask for each answer.  [default: if input is a terminal]")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
-def init(file: Path, ask: bool | None, force: bool, **options: Any) -> None:
+def init(file: Path, ask: bool | None, force: bool, **options: Any) -> int:
     """Write a first machine file FILE from recorded data or a bus.
 
     It shows which signals there are and which of them move, proposes a twin and which signal is which of its inputs
@@ -90,11 +91,15 @@ def init(file: Path, ask: bool | None, force: bool, **options: Any) -> None:
       otolith init drive.toml --opcua opc.tcp://plc:4840 --driver user=otolith
     """
     from otolith.cli.commissioning.draft.choosing import Answers, write_draft
+    from otolith_drivers.errors import OtolithError
 
     if file.suffix != ".toml":
         raise click.BadParameter(f"{str(file)!r}: the name of a machine file ends in .toml", param_hint="FILE")
     if file.exists() and not force:
         text = f"{str(file)!r} exists: choose another name, or overwrite it by --force"
+        raise click.BadParameter(text, param_hint="FILE")
+    if not os.access(file.absolute().parent, os.W_OK | os.X_OK):
+        text = f"{str(file)!r}: its folder is not there, or this user may not write into it"
         raise click.BadParameter(text, param_hint="FILE")
     questions = Questions(asks=sys.stdin.isatty() if ask is None else ask)
     answers = Answers(**{name.name: options.pop(name.name) for name in fields(Answers)})
@@ -109,12 +114,22 @@ def init(file: Path, ask: bool | None, force: bool, **options: Any) -> None:
     target = str(options[kind] if given else click.prompt("its file or address"))
     if options["log"] is not None and kind != "dbc":
         raise click.UsageError("--log needs --dbc, the database of its frames")
-    write_draft(file, _source(kind, target, options, file.parent), answers, questions)
+    stop = StopSignal()
+    try:
+        source = _source(kind, target, options, file.parent, stop)
+    except OtolithError:
+        if not stop.received():
+            raise
+    if stop.received():
+        return stop.code()
+    stop.release()
+    write_draft(file, source, answers, questions)
+    return 0
 
 
-def _source(kind: str, target: str, options: dict[str, Any], folder: Path) -> "OfferedSource":
+def _source(kind: str, target: str, options: dict[str, Any], folder: Path, stop: StopSignal) -> "OfferedSource":
     """Return what the source of that kind offers; each kind imports only what it needs."""
-    stop, seconds, log = StopSignal(), options["seconds"], options["log"]
+    seconds, log = options["seconds"], options["log"]
     if kind == "csv":
         from otolith.cli.commissioning.draft.recorded import table_offers
 

@@ -1,7 +1,6 @@
 """What a Modbus device, an OPC UA server and an MQTT broker offer. All are only read."""
 
 import asyncio
-import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -82,7 +81,7 @@ def server_offers(
     with progress_line(f"reading {endpoint}") as show:
         for reading in range(READINGS):
             if reading:
-                time.sleep(seconds / READINGS)
+                stop.wait(seconds / READINGS)
             variables = asyncio.run(browse_server(options, MAX_VARIABLES, folder))
             for variable in variables:
                 if isinstance(variable.value, int | float) and not isinstance(variable.value, bool):

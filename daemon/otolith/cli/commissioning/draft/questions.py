@@ -23,6 +23,9 @@ class Questions:
             echo(f"{question}  [{proposed}]" if proposed else question)
             try:
                 return check(click.prompt(">", default=proposed, show_default=False, prompt_suffix=" "))
+            except click.Abort:  # Ctrl-C, or the end of standard input
+                echo("", "nothing is written", err=True)
+                raise
             except (ValueError, OtolithError) as error:
                 echo(f"! {error}")
         return check(proposed)
