@@ -123,6 +123,7 @@ def test_a_refused_answer_leaves_no_file(tmp_path: Path, scenario: MotorScenario
         ("--signal", "i=Anker"): ("Anker", "Ankerstrom"),
         ("--signal", "j=Ankerstrom"): ("dc_motor", "j"),
         ("--unit", "Drehzahl=furlong/moon"): ("Drehzahl", "furlong/moon"),
+        ("--unknown", "T_load=steady"): ("T_load", "steady", "constant", "friction"),
         ("--twin", "pmsm"): ("pmsm", "i_q", "--signal"),
     }.items():
         with raises_saying(ConfigurationError, *words):

@@ -50,7 +50,7 @@ def bus_offers(database: Path, bus: BusOptions, seconds: float, folder: Path, st
         asked = f"no signal of {database} came in {seconds:g} s: is the machine on?"
         raise DeviceError(f"CAN bus {bus.title()}: {asked} 'otolith probe can' shows what is on the bus")
     driver = can_driver_lines(bus, picture, seen_from(database, folder))
-    return OfferedSource(title, driver, offers, 0.0, is_live=True, remarks=_remarks(picture))
+    return OfferedSource(title, driver, offers, 0.0, remarks=_remarks(picture))
 
 
 def _offers(picture: Picture) -> list[Offer]:

@@ -26,11 +26,12 @@ from otolith.machine import find_twin, library_twins, load_machine
 from otolith.machine_file import check_name
 from otolith.runtime.preview import duration_text
 from otolith.twin.definition import Definition
+from otolith.twin.unmeasured import Assumption
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.outside_text import CONTROL
 from otolith_drivers.units import Quantity, factor, is_unit
 
-ASSUMPTIONS = ("constant", "slow", "friction")
+ASSUMPTIONS = [kind.value for kind in Assumption if kind is not Assumption.PROPORTIONAL]  # which needs an expression
 MAX_SHOWN = 40  # rows of the table of offers
 
 
@@ -155,7 +156,7 @@ def _signals(
         if questions.asks:
             proposed = pair.offer.name if pair else answers.unknown.get(name, "constant" if is_input else "")
             allowed = ASSUMPTIONS if is_input else ()
-            hint = " (or constant, slow, friction without a sensor)" if is_input else ""
+            hint = f" (or {', '.join(ASSUMPTIONS)} without a sensor)" if is_input else ""
             text = questions.text(f"{what}: which signal{hint}?", proposed, _one_of(known, allowed))
         else:
             text = pair.offer.name if pair else answers.unknown.get(name, "constant")
@@ -195,7 +196,7 @@ def _read(twin: Definition, name: str, offer: Offer, why: str, answers: Answers,
         if not questions.asks:
             why = f"{why}; the unit is assumed, --unit {offer.name}=UNIT states it".removeprefix("; ")
     _check_unit(twin, name, offer, unit)
-    scale = {"scale": number_of(answers.scales[offer.name])} if offer.name in answers.scales else {}
+    scale = {"scale": _number(answers.scales[offer.name])} if offer.name in answers.scales else {}
     return ReadSignal(offer, unit, why, scale)
 
 
@@ -206,7 +207,7 @@ def _check_unit(twin: Definition, name: str, offer: Offer, unit: str) -> None:
         raise ConfigurationError(f"{name} from {offer.name}: {error}") from error
 
 
-def number_of(text: str) -> float:
+def _number(text: str) -> float:
     """Return the number that a scale is; raise ConfigurationError for another text."""
     try:
         return float(text)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from otolith.cli.commissioning.draft.offers import OfferedSource
 
 SOURCES = ("csv", "dbc", "modbus", "opcua", "mqtt")
-ASSUMPTIONS = ("constant", "slow", "friction")
 
 
 def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) -> dict[str, str]:
@@ -28,14 +27,6 @@ def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) 
         if not (name and equals and value):
             raise click.BadParameter(f"{text!r}: write NAME=VALUE")
         pairs[name] = value
-    return pairs
-
-
-def _assumptions(context: click.Context, option: click.Parameter, written: tuple[str, ...]) -> dict[str, str]:
-    pairs = _pairs(context, option, written)
-    for name, value in pairs.items():
-        if value not in ASSUMPTIONS:
-            raise click.BadParameter(f"{name}={value}: write {name}=constant, slow or friction")
     return pairs
 
 
@@ -60,7 +51,7 @@ def _assumptions(context: click.Context, option: click.Parameter, written: tuple
 @click.option("--twin", help="A twin of the library.  [default: the one that fits best]")
 @click.option("--signal", "signals", multiple=True, callback=_pairs, metavar="SIGNAL=NAME",
               help="Which signal of the source an input or output of the twin is.")  # fmt: skip
-@click.option("--unknown", multiple=True, callback=_assumptions, metavar="INPUT=KIND",
+@click.option("--unknown", multiple=True, callback=_pairs, metavar="INPUT=KIND",
               help="An input without a sensor: constant, slow or friction.")  # fmt: skip
 @click.option("--unit", "units", multiple=True, callback=_pairs, metavar="NAME=UNIT",
               help="Unit of a signal of the source.")  # fmt: skip

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.estimation.data_checks import MAD_TO_SD
 from otolith.estimation.objective import adc_step
 from otolith_drivers.units import is_unit
 
 MIN_SAMPLES = 20  # values from which a noise level is taken
-MAD_TO_SD = 1.4826  # of a normal distribution
 UNIT_ENDINGS = ("rpm", "upm", "V", "mV", "A", "mA", "Nm", "N", "Hz", "bar", "kPa", "Pa", "m", "mm", "rad", "deg")
 """Units that stand at the end of a name, as in ``speed_rpm``; others would be words or symbols."""
 
@@ -46,7 +46,6 @@ class OfferedSource:
     offers: Sequence[Offer]
     duration: float  # s
     check: str = ""  # What 'otolith check' needs behind the machine file
-    is_live: bool = False
     remarks: Sequence[str] = ()
 
 
