@@ -11,7 +11,6 @@ import click
 import numpy as np
 import pytest
 from benchmarks.discovery.motor import SIGNALS, Faults, simulate_motor
-from click.testing import CliRunner, Result
 
 from otolith.adaptation.state import (
     AdaptationState,
@@ -27,6 +26,7 @@ from otolith.machine import load_machine
 from otolith.storage.state_store import StateStore
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import state_directory
+from tests.cli.commands import otolith
 from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES
 from tests.messages import raises_saying
@@ -49,12 +49,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def otolith(*arguments: str | Path, answer: str = "") -> Result:
-    return CliRunner().invoke(
-        cli, list(map(str, arguments)), input=answer, catch_exceptions=False, standalone_mode=False
-    )
-
-
 @pytest.fixture(scope="module")
 def kept_files() -> dict[str, bytes]:
     """What a commissioning wrote, once one has run, as it needs the state directory of a test."""
@@ -66,7 +60,7 @@ def commissioned(data: Path, kept_files: dict[str, bytes]) -> tuple[str, str]:
     """Standard output and error of a commissioning that this test's state directory has the files of."""
     folder = store().components_path.parent
     if not kept_files:
-        result = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+        result = otolith("commission", MACHINE, data, "--windows", "8", answers="y\n")
         assert result.exit_code == 0
         kept_files.update({path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()})
         kept_files.update({STDOUT: result.stdout.encode(), STDERR: result.stderr.encode()})
@@ -287,7 +281,7 @@ def test_commission_replays_with_the_levels_of_the_file_unless_they_explain_no_w
 
 @pytest.mark.usefixtures("commissioned")
 def test_commission_keeps_what_was_learned_before_beside(data: Path) -> None:
-    result = otolith("commission", MACHINE, data, "--windows", "2", answer="y\n")
+    result = otolith("commission", MACHINE, data, "--windows", "2", answers="y\n")
     (kept,) = store().components_path.parent.glob("*.kept.json")
     assert f"what was learned before is kept as {kept}" in result.stderr
 

@@ -4,13 +4,11 @@ import math
 import subprocess
 import sys
 import time
-import tomllib
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 
 from otolith.cli.commissioning.draft.assignment import rank
 from otolith.cli.commissioning.draft.offers import Offer
@@ -19,6 +17,7 @@ from otolith.machine import find_twin, library_twins, load_machine
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import simulate
+from tests.cli.commands import otolith, tables
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.logs import frames_of, written
 from tests.messages import assert_says, raises_saying
@@ -26,15 +25,6 @@ from tests.waiting import PATIENCE
 
 ROWS = 1200
 HOSTILE, QUOTED = 'Kanal\x1b[2J"]\x85x = 1', 'Strom"] x = 1 \\'
-
-
-def otolith(*arguments: object, answers: str | None = None) -> Result:
-    texts = list(map(str, arguments))
-    return CliRunner().invoke(cli, texts, input=answers, standalone_mode=False, catch_exceptions=False)
-
-
-def tables(path: Path) -> dict[str, Any]:
-    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def german(path: Path, scenario: MotorScenario, heading: str, rows: int = ROWS, encoding: str = "cp1252") -> Path:

@@ -4,34 +4,23 @@ import json
 import math
 import socket
 import threading
-import tomllib
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
 
-from otolith.cli.main import cli
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
 from otolith_drivers.mqtt_probe import ObservedMessages
+from tests.cli.commands import otolith, tables
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Words, library_server
 from tests.drivers.mqtt_broker import broker_of_this_process, publisher
 from tests.drivers.opcua_server import opcua_server
 from tests.drivers.registers import registers
 from tests.messages import raises_saying
-
-
-def otolith(*arguments: object) -> Result:
-    return CliRunner().invoke(cli, list(map(str, arguments)), standalone_mode=False, catch_exceptions=False)
-
-
-def tables(path: Path) -> dict[str, Any]:
-    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ from otolith.commissioning.structure import remaining_structure
 from otolith.estimation.information import QUANTILE, initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
-from tests.variants import often
 
 WINDOWS, RUNS = 12, 8
 LOADED = [machine for machine in MACHINES if machine.load == "T_load"]
@@ -36,7 +35,7 @@ def inside(problem: Problem, window: Window, machine: Ageing) -> list[bool]:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("machine", often(LOADED[:1], LOADED), ids=lambda machine: machine.plant.name)
+@pytest.mark.parametrize("machine", LOADED, ids=lambda machine: machine.plant.name)
 def test_identified_noise_makes_intervals_right_under_load_noise(machine: Ageing) -> None:
     """Of 96 windows: 95 % less two of its standard deviations, 2.2 % each."""
     shares = coverage(machine, learned=True)

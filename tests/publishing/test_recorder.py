@@ -201,8 +201,7 @@ def test_a_recording_is_read_by_one_child_which_ends_with_its_reader(
     monkeypatch.setattr(recording_module.subprocess, "Popen", Counted)  # type: ignore[attr-defined]
     with RecordingReader(recording, UNITS) as reader:
         (child,) = started
-        assert 0.0 <= reader.progress < 1.0 or reader.progress == pytest.approx(1.0)
-        assert sum(len(rows.times) for rows in reader.chunks()) == 2 * RECORDS or reader.summary_lines()
+        assert sum(len(rows.times) for rows in reader.chunks()) == 5 * RECORDS
         assert reader.progress == 1.0
     assert child.returncode is not None
     assert len(started) == 1
