@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.changes.machines import INDUCTION_MOTOR, LIBRARY_PLANTS, REVERSING_MOTOR
-from benchmarks.changes.plants import HEALTHY, Plant, Values, generator, simulate
+from benchmarks.changes.plants import HEALTHY, Plant, Values, cut, generator, simulate
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.commissioning.identification import identify_noise
 from otolith.estimation.information import initial_prior
@@ -30,6 +29,7 @@ from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
 from otolith_drivers.plant.scenario import simulate as simulate_scenario
 from otolith_drivers.units import to_base
+from tests.adaptation.plant_runs import events_of, measured, windows_of_runs
 from tests.conftest import EXAMPLES, SIGNALS
 
 COVERAGE = 0.95
@@ -105,13 +105,7 @@ def windows_of(case: Case, count: int) -> Iterator[Window]:
         plant = replace(plant, rates=lambda x, u, q: own(x, {**u, "T_load": load(x)}, q))
     else:
         plant = replace(plant, operate=_walking(plant))
-    randoms = [generator(7, case.name, run) for run in range(count)]
-    signals = simulate(plant, randoms, plant.records, HEALTHY, HEALTHY, 0)
-    noise = {row.name: row.noise for row in twin.outputs}
-    for run, random in enumerate(randoms):
-        values = [signals[name][run] + noise.get(name, 0.0) * random.standard_normal(plant.records)
-                  for name in twin.signals]  # fmt: skip
-        yield Window.whole(run, 0.0, plant.period, twin.signals, np.column_stack(values))
+    yield from windows_of_runs(plant, twin, [generator(7, case.name, run) for run in range(count)])
 
 
 def _walking(plant: Plant) -> Callable[[np.random.Generator, Array], Values]:
@@ -171,12 +165,9 @@ def announced(
     faults = () if unbalance is None else (Unbalance.model_validate(fault),)
     samples = simulate_scenario(scenario.model_copy(update={"faults": faults, "seed": seed}))
     names = machine.twin.signals
-    state, events = initial_state("m", "s", machine.problem, machine.plan), []
-    for index in range(count):
-        rows = [[sample.measured[SIGNALS[name]] for name in names] for sample in islice(samples, 200)]
-        state, report = adapt(state, Window.whole(index, 2.0 * index, 0.01, names, np.array(rows)))
-        events.append(report.document.events)
-    return events
+    rows = ([sample.measured[SIGNALS[name]] for name in names] for sample in samples)
+    windows = (Window.whole(k, 2.0 * k, 0.01, names, np.array(list(islice(rows, 200)))) for k in range(count))
+    return events_of(initial_state("m", "s", machine.problem, machine.plan), windows)
 
 
 @pytest.mark.full
@@ -197,17 +188,9 @@ def long_run(case: Case, load: Callable[[Array], Array] | None, count: int) -> l
     random, records, problem = generator(9, case.name, 0), plant.records, case.problem
     signals = simulate(plant, [random], count * records, HEALTHY, HEALTHY, 0)
     noise = {row.name: row.noise for row in problem.twin.outputs}
-    values = np.column_stack([
-        signals[name][0] + noise.get(name, 0.0) * random.standard_normal(count * records)
-        for name in problem.twin.signals
-    ])  # fmt: skip
+    run = measured(signals, 0, random, noise, problem.twin.signals)
     plan = MonitoringPlan(rules=load_rules(), varying=frozenset({"T_load"}))
-    state, events = initial_state("m", "s", problem, plan), []
-    for index in range(count):
-        part, start = values[index * records : (index + 1) * records], index * records * plant.period
-        state, report = adapt(state, Window.whole(index, start, plant.period, problem.twin.signals, part))
-        events.append(report.document.events)
-    return events
+    return events_of(initial_state("m", "s", problem, plan), cut(plant, run, problem.twin.signals))
 
 
 def _given(plant: Plant, load: Callable[[Array], Array]) -> Callable[[np.random.Generator, Array], Values]:
