@@ -9,6 +9,8 @@ import json
 import logging
 import re
 import socket
+import subprocess
+import sys
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -400,3 +402,12 @@ def test_each_attack_is_escaped(name: str) -> None:
     for text in HOSTILE:
         some = text[:MOST] if name in BOUNDED else text
         writer.check(some, writer.write(some))
+
+
+def test_a_log_line_of_a_command_without_a_log_is_escaped() -> None:
+    """Libraries warn with what a device has sent, and most commands set up no log."""
+    warn = "logging.getLogger('library').warning('from a device: \\x1b[2J\\nnone')"
+    code = f"import atexit, logging; from otolith.__main__ import main; atexit.register(lambda: {warn}); main()"
+    done = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True, check=True)
+    assert_lines(done.stderr, 1)
+    assert "from a device" in done.stderr

@@ -9,6 +9,7 @@ _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 import codecs  # noqa: E402 - after the line above
 import errno  # noqa: E402 - as above
 import io  # noqa: E402 - as above
+import logging  # noqa: E402 - as above
 import os  # noqa: E402 - as above
 import sys  # noqa: E402 - as above
 
@@ -35,11 +36,13 @@ def main() -> None:
 
     from otolith.cli.common import INTERRUPTED  # noqa: PLC0415
     from otolith.cli.main import cli  # noqa: PLC0415
-    from otolith.cli.terminal import echo, echo_traceback  # noqa: PLC0415
+    from otolith.cli.terminal import LogFormatter, echo, echo_traceback  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
     codecs.register_error("otolith", written_plainly)
     sys.excepthook = echo_traceback
+    if logging.lastResort is not None:  # by which a command without a log prints warnings, also those of libraries
+        logging.lastResort.setFormatter(LogFormatter())
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that has no 'Ω' gets 'ohm'
             stream.reconfigure(errors="otolith")
