@@ -235,12 +235,10 @@ def _causes(link: Link) -> list[str]:
 
 
 def _remark(count: int, expected: float, *, any_came: bool) -> str:
+    if count >= MIN_SHARE * expected:
+        return ""
     if count:
-        return (
-            ""
-            if count >= MIN_SHARE * expected
-            else f"; {expected:.0f} were expected: check the cycle time in the device"
-        )
+        return f"; {expected:.0f} were expected: check the cycle time in the device"
     if any_came:
         return ": other signals come, so check its entry in [signals]"
     return ": is the machine on?"
