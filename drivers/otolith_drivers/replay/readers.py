@@ -405,8 +405,7 @@ def costs_a_process(path: Path) -> bool:
     """Whether ``path`` is a recording; raise ConfigurationError if it has only the name of one, or is missing."""
     if suffix_of(path) != RECORDING:
         return False
-    if not path.is_file():
-        raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+    DataFile(path).close()  # raises if it cannot be read
     if not head_of(path).startswith(RECORDING_HEAD):
         raise ConfigurationError(f"{path}: is no recording of Rerun, which its name says")
     return True

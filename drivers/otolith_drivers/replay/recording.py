@@ -26,7 +26,7 @@ from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay import recording_child
-from otolith_drivers.replay.readers import Array, Integers, Reader, Rows
+from otolith_drivers.replay.readers import Array, DataFile, Integers, Reader, Rows
 from otolith_drivers.replay.recording_child import END, FAULT, OPENED, PART, SAMPLES_ENTITY, TIMES, TIMES_ENTITY, WINDOW
 from otolith_drivers.units import factor
 
@@ -138,8 +138,7 @@ class RecordingReader(Reader):
         self._units = units
         self._written: dict[str, str] | None = None  # Unit of each recorded signal; None until the file tells them
         self._closed, self._ended = True, False
-        if not path.is_file():
-            raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+        DataFile(path).close()  # raises if it cannot be read
         self._child = _Parts(path)
         self._parts = iter(self._child)
         try:
