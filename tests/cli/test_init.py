@@ -115,6 +115,11 @@ def test_a_refused_answer_leaves_no_file(tmp_path: Path, scenario: MotorScenario
         ("--unit", "Drehzahl=furlong/moon"): ("Drehzahl", "furlong/moon"),
         ("--unknown", "T_load=steady"): ("T_load", "steady", "constant", "friction"),
         ("--twin", "pmsm"): ("pmsm", "i_q", "--signal"),
+        ("--sample-period", "fast"): ("Sample period", "fast"),
+        ("--window", "2 V"): ("window", "V", "s"),
+        ("--name", "winch 1"): ("machine", "winch 1"),
+        ("--scale", "Drehzal=2"): ("Drehzal", "Drehzahl"),
+        ("--noise", "j=5 mA"): ("noise", "j"),
     }.items():
         with raises_saying(ConfigurationError, *words):
             otolith("init", file, "--csv", data, *answers)
@@ -127,13 +132,13 @@ def test_every_answer_is_also_an_option(tmp_path: Path, scenario: MotorScenario)
     data, file = german(tmp_path / "montag.csv", scenario, heading), tmp_path / "drive.toml"
     otolith("init", file, "--csv", data, "--twin", "dc_motor_coulomb", "--name", "winch", "--site", "hall-2",
             "--signal", "V_a=Kanal 1", "--signal", "i=Kanal 2", "--signal", "omega=Kanal 3", "--unknown",
-            "T_load=slow", "--unit", "Kanal 3=1/min", "--noise", "i=5 mA", "--sample-period", "20 ms",
-            "--window", "3 s")  # fmt: skip
+            "T_load=slow", "--unit", "Kanal 3=1/min", "--noise", "i=5 mA", "--noise", "V_a=10 mV", "--sample-period",
+            "20 ms", "--window", "3 s")  # fmt: skip
     read = tables(file)
     assert read["machine"] == {"name": "winch", "site": "hall-2"}
     assert read["signals"]["omega"] == {"column": "Kanal 3", "unit": "1/min"}
     assert read["signals"]["T_load"] == {"unknown": "slow"}
-    assert read["noise"]["i"] == "5 mA"
+    assert (read["noise"]["i"], read["noise"]["V_a"]) == ("5 mA", "10 mV")
     assert read["window"] == {"length": "3 s", "sample_period": "20 ms"}
     load_machine(file)
 

@@ -149,6 +149,8 @@ def _signals(
     """Return the signals that the source has, and the inputs that nothing measures with what is assumed of them."""
     known = {offer.name: offer for offer in offers}
     twin, read, assumed = proposal.twin, dict[str, ReadSignal](), dict[str, str]()
+    for name in answers.scales:
+        _offer_named(name, known)
     for name in dict.fromkeys(twin.signals):
         what = f"{name} [{twin.unit_of(name)}], {meaning_of(twin, name)}"
         pair = proposal.pairs.get(name)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import click
 
 from otolith.cli.terminal import echo
-from otolith_drivers.errors import OtolithError
+from otolith_drivers.errors import ConfigurationError, OtolithError
 
 
 class Questions:
@@ -18,6 +18,9 @@ class Questions:
         """Return what ``check`` makes of the answer; asks again while it raises ValueError or OtolithError.
 
         The proposal may be text from outside, so that the escape of the terminal prints it.
+
+        Raises:
+            OtolithError: nobody is asked, and ``check`` refuses the proposal.
         """
         while self.asks:
             echo(f"{question}  [{proposed}]" if proposed else question)
@@ -28,7 +31,10 @@ class Questions:
                 raise
             except (ValueError, OtolithError) as error:
                 echo(f"! {error}")
-        return check(proposed)
+        try:
+            return check(proposed)
+        except ValueError as error:
+            raise ConfigurationError(f"{question}: {error}") from error
 
     def choice(self, question: str, options: list[str]) -> str | None:
         """Return one of ``options``; None where nobody is asked."""

@@ -141,10 +141,10 @@ def _noise(draft: MachineDraft) -> Iterator[str]:
     yield "## Standard deviation of the sensors, from the fastest changes of the values that came."
     yield "## 'otolith noise' finds better ones in a record of the healthy machine."
     yield "[noise]"
+    for name, level in draft.noise.items():
+        yield f"{toml_key(name)} = {toml_value(level)}"
     for output in draft.twin.outputs:
-        if output.name in draft.noise:
-            yield f"{toml_key(output.name)} = {toml_value(draft.noise[output.name])}"
-        else:
+        if output.name not in draft.noise:
             yield f'# {toml_key(output.name)} = "{output.noise:.6g} {output.unit}"  # of the twin: the values show none'
     yield ""
 
