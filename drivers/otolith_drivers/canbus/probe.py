@@ -130,13 +130,17 @@ class ObservedFrames:
         if self.message is not None:
             self._decode(self.message, data)
 
-    def series(self, signal: str) -> list[float]:
-        """The numbers that a signal of the database had in the frames that are kept."""
+    def series(self) -> dict[str, list[float]]:
+        """The numbers that each signal of the database had in the frames that are kept."""
+        series: dict[str, list[float]] = {}
         if self.message is None:
-            return []
-        highest = j1939.highest_value(self.message, self.message.get_signal_by_name(signal))
-        numbers = ((_numbers(self.message, data) or {}).get(signal, math.nan) for data in self.history)
-        return [number for number in numbers if math.isfinite(number) and number <= highest]
+            return series
+        rows = [_numbers(self.message, data) or {} for data in self.history]
+        for signal in self.message.signals:
+            highest = j1939.highest_value(self.message, signal)
+            numbers = (row.get(signal.name, math.nan) for row in rows)
+            series[signal.name] = [number for number in numbers if math.isfinite(number) and number <= highest]
+        return series
 
     def _decode(self, message: Message, data: bytes) -> None:
         numbers = _numbers(message, data)

@@ -92,6 +92,8 @@ def test_the_database_gives_names_values_and_ranges() -> None:
     speed = values["RotorSpeed"]
     assert (speed.low, speed.beyond) == (-2.0, 1)
     assert speed.high == pytest.approx(327.67)
+    (observed,) = {id(frames): frames for frames, _, _ in picture.signals()}.values()
+    assert observed.series()["RotorSpeed"] == pytest.approx([1.0, -2.0, 327.67])
     assert [message.name for message in picture.missing()] == ["MotorElectrical"]
     assert "in the database, but not received: MotorElectrical" in list(remarks(picture))
     lines = list(can_signal_lines(picture))

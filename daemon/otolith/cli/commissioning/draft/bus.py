@@ -61,13 +61,14 @@ def _offers(picture: Picture) -> list[Offer]:
         titles.setdefault(frames.message.name if frames.message else "", frames.title)
     rows = [row for row in rows if row[0].message and row[0].title == titles[row[0].message.name]]
     names = Counter(signal.name for _, signal, _ in rows)
+    series = {title: frames.series() for title, frames in {row[0].title: row[0] for row in rows}.items()}
     offers = []
     for frames, signal, _ in rows:
         message = frames.message.name if frames.message else ""
         keys = {"signal": signal.name} | ({"message": message} if names[signal.name] > 1 else {})
         name = signal.name if names[signal.name] == 1 else f"{message}.{signal.name}"
         unit = signal.unit if signal.unit and is_unit(signal.unit) else None
-        offers.append(Offer(name, unit, keys, np.array(frames.series(signal.name)), frames.period))
+        offers.append(Offer(name, unit, keys, np.array(series[frames.title][signal.name]), frames.period))
     return offers
 
 
