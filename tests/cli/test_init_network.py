@@ -9,11 +9,13 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from asyncua import Client
 
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
 from otolith_drivers.mqtt_probe import ObservedMessages
+from otolith_drivers.opcua import connection
 from tests.cli.commands import otolith, tables
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Words, library_server
@@ -50,7 +52,15 @@ def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tm
         otolith("init", tmp_path / "other.toml", "--modbus", target, "--registers", "10..12", "--seconds", 1.5)
 
 
-def test_variables_of_a_server_find_the_twin(tmp_path: Path) -> None:
+def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    browsed = []
+
+    async def counted(client: Client, most: int) -> list[connection.Variable]:
+        browsed.append(client)
+        return await browse(client, most)
+
+    browse = connection.browse
+    monkeypatch.setattr(connection, "browse", counted)
     variables = {"ArmatureVoltage": (12.0, "V"), "ArmatureCurrent": (0.5, "A"), "RotorSpeed": (900.0, "rpm"),
                  "CabinetTemperature": (30.0, "°C")}  # fmt: skip
     port, file = free_port(socket.SOCK_STREAM), tmp_path / "plc.toml"
@@ -59,6 +69,7 @@ def test_variables_of_a_server_find_the_twin(tmp_path: Path) -> None:
             "init", file, "--opcua", f"opc.tcp://127.0.0.1:{port}/motor", "--seconds", 0.5, "--driver", "stamps=server"
         )
         assert otolith("check", file).return_value == 0
+    assert len(browsed) == 1  # which costs a server several requests for each variable
     read = tables(file)
     assert read["driver"]["stamps"] == "server"
     assert {name: table.get("node") for name, table in read["signals"].items()} == {

@@ -3,7 +3,7 @@
 import contextlib
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,8 @@ from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
 from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
+    from asyncua import Client
+
     from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.canbus.probe import Picture
@@ -361,7 +363,7 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     given = {name: value for name, value in keys.items() if value is not None}
     options = validated({"endpoint": endpoint, "timeout": f"{timeout} s"} | given, OpcuaOptions, ())
     with progress_line(f"reading {endpoint}"):
-        variables = asyncio.run(browse_server(options, most))
+        variables = asyncio.run(_browse(options, most))
     if as_json:
         echo_json({"variables": [_opcua_document(one) for one in variables]})
     else:
@@ -373,18 +375,23 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     return 0 if variables else NOTHING_THERE
 
 
-async def browse_server(options: "OpcuaOptions", most: int, folder: Path = Path()) -> "list[Variable]":
-    """Return the variables of the server; raise DeviceError if it cannot be read.
+async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
+    from otolith_drivers.opcua.connection import browse
 
-    Files of ``options`` are relative to ``folder``.
-    """
+    async with opened_server(options, Path()) as client:
+        return await browse(client, most)
+
+
+@contextlib.asynccontextmanager
+async def opened_server(options: "OpcuaOptions", folder: Path) -> "AsyncIterator[Client]":
+    """A session with the server; DeviceError if it cannot be read. Files of ``options`` are relative to ``folder``."""
     from otolith_drivers.errors import DeviceError
-    from otolith_drivers.opcua.connection import OpcUaCredentials, browse, connected, reason
+    from otolith_drivers.opcua.connection import OpcUaCredentials, connected, reason
 
     credentials = OpcUaCredentials.load(options, folder)
     try:
         async with connected(options, credentials) as (client, _):
-            return await browse(client, most)
+            yield client
     except Exception as error:  # the library raises anything that a server makes it raise
         refused = isinstance(error, ConnectionRefusedError)
         remedy = "; the host answers, but the port is closed: is the server on, and the port right?" if refused else ""

@@ -2,20 +2,23 @@
 
 import asyncio
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource, unit_in
-from otolith.cli.commissioning.probe import address_keys, browse_server, read_registers
+from otolith.cli.commissioning.probe import address_keys, opened_server, read_registers
 from otolith.cli.common import StopSignal, progress_line
 from otolith_drivers.base import find_driver
 from otolith_drivers.config_files import validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, counted
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
 from otolith_drivers.units import is_unit
+
+if TYPE_CHECKING:
+    from otolith_drivers.opcua.connection import OpcuaOptions, Variable
 
 MAX_VARIABLES = 500  # of a server that are read
 READINGS = 4  # of an OPC UA server in the time of listening
@@ -77,18 +80,13 @@ def server_offers(
     from otolith_drivers.opcua.connection import OpcuaOptions
 
     options = validated({"endpoint": endpoint} | dict(keys), OpcuaOptions, ())
-    values: dict[str, list[float]] = {}
     with progress_line(f"reading {endpoint}") as show:
-        for reading in range(READINGS):
-            if reading:
-                stop.wait(seconds / READINGS)
-            variables = asyncio.run(browse_server(options, MAX_VARIABLES, folder))
-            for variable in variables:
-                if isinstance(variable.value, int | float) and not isinstance(variable.value, bool):
-                    values.setdefault(variable.node, []).append(float(variable.value))
-            show(f"reading {endpoint}: {reading + 1} of {READINGS}")
-            if stop.received():
-                break
+        variables, readings = asyncio.run(_watched(options, folder, seconds, stop, show))
+    values: dict[str, list[float]] = {}
+    for reading in readings:
+        for variable, value in zip(variables, reading, strict=True):
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                values.setdefault(variable.node, []).append(float(value))
     numbers = [variable for variable in variables if variable.node in values]
     if not numbers:
         raise DeviceError(f"OPC UA {endpoint}: no variable with a number; 'otolith probe opcua' shows what there is")
@@ -102,6 +100,22 @@ def server_offers(
         offers.append(Offer(name, unit, {"node": variable.node}, series[np.isfinite(series)], options.interval))
     lines = ["[driver]", 'type = "opcua"', f"endpoint = {toml_value(endpoint)}", *_rows(keys)]
     return OfferedSource(f"OPC UA {endpoint}: {counted(len(offers), 'number')}", lines, offers, 0.0)
+
+
+async def _watched(
+    options: "OpcuaOptions", folder: Path, seconds: float, stop: StopSignal, show: Callable[[str], None]
+) -> "tuple[list[Variable], list[list[Any]]]":
+    """Return the variables of a server, and their values in each of several readings."""
+    from otolith_drivers.opcua.connection import browse, present_values
+
+    async with opened_server(options, folder) as client:
+        variables = await browse(client, MAX_VARIABLES)
+        readings = [[variable.value for variable in variables]]
+        while len(readings) < READINGS and not stop.received():
+            show(f"reading {options.endpoint}: {len(readings)} of {READINGS}")
+            await asyncio.to_thread(stop.wait, seconds / READINGS)
+            readings.append(await present_values(client, variables))
+        return variables, readings
 
 
 def broker_offers(
