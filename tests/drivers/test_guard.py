@@ -223,7 +223,9 @@ def test_open_that_blocks_keeps_nobody_back(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("close", [raises(OSError("gone")), lambda: time.sleep(PATIENCE)], ids=["raises", "blocks"])
 def test_close_ends_in_time_and_raises_nothing(close: Callable[[], None]) -> None:
     with machine_with(PlugIn(close=close)) as (machine, _):
+        begin = time.monotonic()
         machine.close()
+        assert time.monotonic() - begin < 0.5 * PATIENCE
 
 
 NOW = "now"
