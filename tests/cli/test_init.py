@@ -119,6 +119,7 @@ def test_a_refused_answer_leaves_no_file(tmp_path: Path, scenario: MotorScenario
         ("--window", "2 V"): ("window", "V", "s"),
         ("--name", "winch 1"): ("machine", "winch 1"),
         ("--scale", "Drehzal=2"): ("Drehzal", "Drehzahl"),
+        ("--scale", "Kanal=1=2"): ("'Kanal=1'",),
         ("--noise", "j=5 mA"): ("noise", "j"),
     }.items():
         with raises_saying(ConfigurationError, *words):

@@ -16,14 +16,15 @@ from otolith.cli.terminal import echo
 if TYPE_CHECKING:
     from otolith.cli.commissioning.draft.offers import OfferedSource
 
+OF_THE_SOURCE = ("units", "scales")  # options by the names of the source, which may be any text
 SOURCES = ("csv", "dbc", "modbus", "opcua", "mqtt")
 
 
 def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) -> dict[str, str]:
-    """Return the texts ``NAME=VALUE`` of a repeated option; the name may have '=' only with the last one between."""
+    """Return the texts ``NAME=VALUE`` of a repeated option; only names of the source may have a '='."""
     pairs = {}
     for text in written:
-        name, equals, value = text.rpartition("=") if option.name == "units" else text.partition("=")
+        name, equals, value = text.rpartition("=") if option.name in OF_THE_SOURCE else text.partition("=")
         if not (name and equals and value):
             raise click.BadParameter(f"{text!r}: write NAME=VALUE")
         pairs[name] = value
