@@ -20,6 +20,7 @@ from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, open_bus
 from otolith_drivers.canbus.driver import CanOptions, build
 from otolith_drivers.canbus.options import CanSource
+from otolith_drivers.common.guard import GuardedSource
 
 RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
 SETTLE = 0.5  # s after the last frame
@@ -118,7 +119,9 @@ def receive_with_driver(seconds: float) -> Result:
         (Path(folder) / "bench.dbc").write_text(database(), encoding="utf-8")
         signals = tuple(Signal(name, "rad/s", CanSource(signal=f"Speed{index}")) for index, name in enumerate(names))
         options = CanOptions(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
-        driver = build(options, Setup(signals, Path(folder), MESSAGES / RATE))
+        period = MESSAGES / RATE
+        setup = Setup(signals, Path(folder), period)
+        driver = GuardedSource.built("bench", names, period, lambda: build(options, setup))  # as the daemon has it
     driver.open(rings.deliver)
     thread = next(thread for thread in threading.enumerate() if thread.name == "can-receive")
     clock = time.pthread_getcpuclockid(thread.ident or 0)
