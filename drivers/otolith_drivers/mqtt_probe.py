@@ -60,7 +60,7 @@ class ObservedMessages(Messages):
 def observe(
     options: MqttOptions, folder: Path, seconds: float, stopped: Callable[[], bool], topics: str = ALL
 ) -> ObservedMessages:
-    """Return what came within ``seconds``, connecting included; raise DeviceError if the broker refuses or is absent."""
+    """Return what came within ``seconds``, connecting included; raise DeviceError if the broker refuses or is none."""
     messages = ObservedMessages(options, topics)
     driver = listener(options, Setup((), folder, 1.0), messages)
     driver.open(lambda _: None)
