@@ -138,10 +138,16 @@ def _locked(path: Path, wait: int = 0) -> Iterator[None]:
     while True:
         with path.open("w", encoding="utf-8") as file:
             fcntl.flock(file, fcntl.LOCK_EX | wait)
-            with suppress(FileNotFoundError):
-                if os.path.samestat(path.stat(), os.fstat(file.fileno())):
-                    yield
-                    return
+            if _is_in_place(path, file.fileno()):
+                yield
+                return
+
+
+def _is_in_place(path: Path, handle: int) -> bool:
+    """Return whether an open file is still the one at ``path``."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(path.stat(), os.fstat(handle))
+    return False
 
 
 def _write(file: Path, text: str) -> None:

@@ -191,6 +191,11 @@ def test_a_lock_is_held_by_one_although_its_file_is_removed(tmp_path: Path) -> N
     assert max(most) == 1
 
 
+def test_an_error_while_a_lock_is_held_is_not_taken_for_a_removed_lock(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="kernel"), kernel_cache._locked(tmp_path / "lock"):
+        raise FileNotFoundError("kernel")
+
+
 @pytest.mark.parametrize("disk", ["read-only", "full"])
 def test_a_cache_that_cannot_be_written_is_read(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, disk: str
