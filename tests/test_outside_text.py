@@ -33,6 +33,7 @@ from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LiveTable
 from otolith.cli.operation.unit_file import comment, directive
 from otolith.cli.terminal import JournalFormatter, LogFormatter, echo, echo_csv, echo_json
+from otolith.health.labels import TimeLabels
 from otolith.health.schema import DriverDocument, EventChange, EventDocument, ReportDocument
 from otolith.machine_file import MachineTable
 from otolith.publishing.html_report import html_report
@@ -277,6 +278,17 @@ def is_kept(text: str, written: str) -> None:
     assert (read.driver, read.notes, read.twin) == (expected.driver, expected.notes, expected.twin)
 
 
+def resent(text: str) -> str:
+    """What the history answers about an event after the clock was set."""
+    report = report_with(text).model_copy(update={"machine": "press-3", "site": "hall-1"})
+    return written([report], labels=TimeLabels(((START - 100.0, 3600.0),))).messages("event", 1000)[-1]
+
+
+def is_the_message(text: str, message: str) -> None:
+    assert_lines(message, 1)
+    assert EventDocument.model_validate_json(message).text == report_with(whole(text)).events[0].text
+
+
 def sent_to_a_command(text: str) -> str:
     """What ``on_event`` gets on its standard input."""
     with tempfile.TemporaryDirectory() as folder:
@@ -336,6 +348,7 @@ def logged_by_the_recorder(text: str) -> str:
 DOCUMENTS = {
     "HTML": Writer(page_of, is_a_page),
     "history": Writer(kept, is_kept),
+    "history: event": Writer(resent, is_the_message),
     "command": Writer(sent_to_a_command, is_the_event),
     "systemd": Writer(told_to_systemd, are_two_assignments),
     "recording: state": marked(operator_text),
@@ -343,7 +356,7 @@ DOCUMENTS = {
     "recording: log": Writer(logged_by_the_recorder, lambda _, written: assert_lines(written, 1)),
 }
 """Writers that take some milliseconds."""
-BOUNDED, MOST = {"HTML", "history"}, 1 << 14
+BOUNDED, MOST = {"HTML", "history", "history: event"}, 1 << 14
 """Writers behind the guard of drivers, which cuts their texts; the database has a size; and so many characters."""
 
 

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.browser import Browser, browser, program
 
 from benchmarks import pictures
+from otolith.health.labels import TimeLabels
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
 from otolith.health.text import texts_in
@@ -68,11 +69,16 @@ def state_of(level: Level, since: float, reason: str = "") -> HealthDocument:
 
 
 def written(
-    reports: list[ReportDocument], *, machine: str = MACHINE, site: str = SITE, description: str = ""
+    reports: list[ReportDocument],
+    *,
+    machine: str = MACHINE,
+    site: str = SITE,
+    description: str = "",
+    labels: TimeLabels = TimeLabels(),  # noqa: B008 - immutable
 ) -> HistoryReader:
     writer = HistoryWriter(history_path(site, machine), Bounds(20_000_000, 3650, 24))
     numbers, _ = writer.open(START)
-    writer.description = description
+    writer.description, writer.labels = description, labels
     for report in reports:
         writer.add(numbers.number(report.model_copy(update={"machine": machine, "site": site})))
         writer._write_waiting()

@@ -388,7 +388,7 @@ class HistoryReader:
             if not labels.spans:
                 return text
             if kind == "event":
-                return labels.of_event(EventDocument.model_validate_json(text)).model_dump_json(exclude_none=True)
+                return labels.of_event(EventDocument.model_validate_json(text)).json_line()
             return labels.of_report(ReportDocument.from_json(text)).to_json()
 
         return self._undamaged(rows, published)
