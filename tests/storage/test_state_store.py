@@ -23,7 +23,6 @@ from otolith.discovery.decision import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store
-from otolith.storage.disk import MIN_FAILURES
 from otolith.storage.state_store import LockedError, StateStore, StateWriter
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import writable
@@ -182,7 +181,6 @@ def test_a_state_directory_that_can_be_used_later_is_used_then(
         store.lock_or_later()
     writer = StateWriter(store, 0.0)
     writer.fail(raised.value)
-    assert writer.outage == ""
     writer.start()
     writer.save(with_friction(-0.002))
     wait_for(lambda: str(folder) in writer.outage)
@@ -214,15 +212,6 @@ def test_another_process_that_came_first_ends_who_waited_for_the_directory(tmp_p
     assert writer.locked_out is not None
     assert not other.components_path.exists()
     other.unlock()
-
-
-def test_an_output_that_fails_again_and_again_has_an_outage(store: StateStore) -> None:
-    writer = StateWriter(store, 0.0)
-    for _ in range(MIN_FAILURES - 1):
-        writer.fail(ServiceError("the disk is busy"))
-        assert writer.outage == ""
-    writer.fail(ServiceError("the disk is full"))
-    assert "the disk is full" in writer.outage
 
 
 def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:

@@ -150,7 +150,7 @@ class Window:
     absent: Mapping[str, str] = field(default_factory=dict)
     """Of several sources, those that are down or gave no sample: in words, by name."""
     outages: Mapping[str, str] = field(default_factory=dict)
-    """Outputs of the daemon that do not work, and why, by name."""
+    """Outputs of the daemon that fail for long, and why, by name."""
     ahead: float = 0.0  # Unix time minus that clock, s; only texts have Unix times
 
     @classmethod

@@ -208,7 +208,7 @@ class WindowDocument(DocumentModel):
     quality: QualityDocument
     observed: dict[str, float] | None = None  # Mean of each observed signal, as a temperature in K
     absent: dict[str, str] | None = None  # Of several sources, those that are down or gave no sample: in words, by name
-    outages: dict[str, str] | None = None  # Outputs of the daemon that do not work, and why, by name
+    outages: dict[str, str] | None = None  # Outputs of the daemon that fail for long, and why, by name
 
 
 class CrossingDocument(DocumentModel):

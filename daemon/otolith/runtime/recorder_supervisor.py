@@ -85,11 +85,12 @@ class RecorderSupervisor:
 
     @property
     def outage(self) -> str:
-        """Why nothing is recorded; empty if something is, or should not be."""
-        if not self.is_enabled or self._process.alive or self._first is not None:
-            return ""
+        """Why nothing is recorded; empty if something is, or should not be.
+
+        A recorder that always dies also lives for a moment each time: it works again once its pause is reset.
+        """
         ended = f"the recorder has ended {self._process.deaths} times" if self._process.deaths >= MIN_DEATHS else ""
-        return self._problem or ended
+        return (self._problem or ended) if self.is_enabled else ""
 
     @property
     def restarts(self) -> int:
@@ -143,10 +144,12 @@ class RecorderSupervisor:
         for waiting in self._process.replies():
             self._unanswered, self._unwritten = max(0, self._unanswered - 1), waiting
             self._effort.begin(now, self._process.processor_time)
-        seconds = self._effort.seconds(now, self._process.processor_time)
-        if self._process.alive and self._unanswered and seconds > RECORDER_TIMEOUT:
-            log.warning("the recorder has not answered in %g s of processor time and waiting, and is killed", seconds)
-            self._process.kill()
+        if self._process.alive and self._unanswered:
+            seconds = self._effort.seconds(now, self._process.processor_time)
+            if seconds > RECORDER_TIMEOUT:
+                what = "the recorder has not answered in"
+                log.warning("%s %g s of processor time and waiting, and is killed", what, seconds)
+                self._process.kill()
         if self._process.alive:
             if self._process.age > RECORDER_HEALTHY_AGE:
                 self._process.reset_backoff()
@@ -187,6 +190,8 @@ class RecorderSupervisor:
     def _launch(self, path: Path, folder: RecordingFolder | None, now: float) -> None:
         arguments = (path, self._machine.recorded(self._machine.driver.sampling), folder)
         self._effort.begin(now, self._process.processor_time)
+        if self._problem:  # its deaths were failures of the disk, which works again
+            self._process.reset_backoff()
         self._problem = ""
         log.info("recording to %s", path)
         if self._process.starts or self._early:

@@ -61,7 +61,8 @@ RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writi
 STALL_TIMEOUT = 30.0  # s of effort without a finished window, and three window lengths; then no watchdog is fed
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
-MAX_STATUS = 1000  # characters of what systemd is told: a datagram that is too long would be lost
+OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
+MAX_STATUS = 1000  # characters of a line for systemd; a longer one is cut, as a datagram that is too long is not sent
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
 
@@ -175,6 +176,7 @@ class Service:
         self._evidence = EvidenceWriter(machine)
         self._read_clocks, self._clock = clocks, ServiceClock(read=clocks)
         self._clock_events: tuple[EventDocument, ...] = ()  # that the next report has
+        self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
@@ -353,11 +355,11 @@ class Service:
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
         absent = absent_sources(link, window, self._outputs)
-        self._supervisor.submit(replace(window, absent=absent, outages=self._outages()), now)
+        self._supervisor.submit(replace(window, absent=absent, outages=self._outages(now)), now)
 
-    def _outages(self) -> dict[str, str]:
-        """Return the outputs that do not work, and why: none of them keeps the machine from being monitored."""
-        outages = {
+    def _outages(self, now: float) -> dict[str, str]:
+        """Return the outputs that have failed for ``OUTAGE_AFTER``, and why; the machine is monitored without them."""
+        reasons = {
             "state": self._writer.outage,
             "history": "" if self._history is None else self._history.outage,
             "evidence": self._evidence.outage,
@@ -365,7 +367,8 @@ class Service:
             "on_event": self._command.outage,
             **({} if self._publisher is None else self._publisher.outages(datetime.now(UTC))),
         }
-        return {name: reason for name, reason in outages.items() if reason}
+        self._failing = {name: self._failing.get(name, now) for name, reason in reasons.items() if reason}
+        return {name: reasons[name] for name, since in self._failing.items() if now - since >= OUTAGE_AFTER}
 
     def _follow_wall_clock(self) -> None:
         """Let the labels follow the wall clock. If it was set, save them, and note it in the next report."""

@@ -20,9 +20,7 @@ from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
 
-# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
-WRITE_RETRY = 30.0  # s from an error to the next try
-MIN_FAILURES = 2  # tries in a row that failed: no disk that was busy once
+WRITE_RETRY = 30.0  # s from an error to the next try; docs/reference/thresholds-storage.md has its origin
 
 
 class WriterThread(ABC):
@@ -32,13 +30,13 @@ class WriterThread(ABC):
         """``interval`` in s; ``loss`` names for the log what an error keeps from being written."""
         self._interval, self._loss = interval, loss
         self._wakeup, self._stopping = threading.Event(), threading.Event()
-        self._retry_at, self._last_error, self._failures = 0.0, "", 0
+        self._retry_at, self._last_error = 0.0, ""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     @property
     def outage(self) -> str:
-        """Why nothing could be written in the last tries; empty if it could."""
-        return f"{self._loss}: {self._last_error}" if self._failures >= MIN_FAILURES else ""
+        """Why the last try wrote nothing; empty if it did."""
+        return f"{self._loss}: {self._last_error}" if self._last_error else ""
 
     def start(self) -> None:
         """Start the thread."""
@@ -69,7 +67,6 @@ class WriterThread(ABC):
         if text != self._last_error:
             log.warning("%s: %s", self._loss, text)
         self._last_error, self._retry_at = text, time.monotonic() + WRITE_RETRY
-        self._failures += 1
 
     def _run(self) -> None:
         while True:
@@ -82,7 +79,7 @@ class WriterThread(ABC):
                 except Exception as error:  # noqa: BLE001 - OSError, sqlite3.Error, OtolithError, or a bug: none ends it
                     self.fail(error)
                 else:
-                    self._last_error, self._retry_at, self._failures = "", 0.0, 0
+                    self._last_error, self._retry_at = "", 0.0
             if is_last:
                 return
             self.read()
