@@ -41,7 +41,7 @@ class Computer:
     error: float = 0.0
     boot: str = "first"
     time: float = NOW  # Unix s
-    booted: float = NOW - 1000.0
+    booted: float = NOW - 2.0 * HOUR
     suspended: float = 0.0  # s since the boot
 
     def read(self) -> ClockReading:
@@ -150,14 +150,17 @@ class Case:
     then: dict[int, float] = field(default_factory=dict)  # Error from a window on, s
     per_window: float = 0.0  # By how much the error grows with each window, s
     events: tuple[float, ...] = ()  # By how much the clock was set, s, as events tell
+    uptime: float = 2.0 * HOUR  # At the start, s
 
 
 WRONG, RIGHT = 10, 13  # windows with an open event from which on the wall clock is wrong, and right again
 CASES = {
     "right": Case(0.0),
-    "1970, then right": Case(-NOW, {WRONG: 0.0}, events=(NOW,)),
-    "a year behind, then right": Case(-YEAR, {WRONG: 0.0}, events=(YEAR,)),
-    "a year ahead, then right": Case(YEAR, {WRONG: 0.0}, events=(-YEAR,)),
+    "boots in 1970, then right": Case(-NOW, {WRONG: 0.0}, uptime=20.0),
+    "boots a year behind, then right": Case(-YEAR, {WRONG: 0.0}, uptime=20.0),
+    "boots a year ahead, then right": Case(YEAR, {WRONG: 0.0}, uptime=20.0),
+    "boots a night behind, then right": Case(-0.5 * DAY, {WRONG: 0.0}, uptime=20.0),
+    "1970, right after hours": Case(-NOW, {WRONG: 0.0}, events=(NOW,)),
     "a year back, then right": Case(0.0, {WRONG: -YEAR, RIGHT: 0.0}, events=(-YEAR, YEAR)),
     "+1 h, then right": Case(0.0, {WRONG: HOUR, RIGHT: 0.0}, events=(HOUR, -HOUR)),
     "-1 h, then right": Case(0.0, {WRONG: -HOUR, RIGHT: 0.0}, events=(-HOUR, HOUR)),
@@ -188,7 +191,7 @@ def test_no_window_is_affected_by_the_wall_clock(name: str, daemons: Start) -> N
     true_raised, true_cleared = of_limit(right.reader.events(0.0))
     true_times = [row.time for row in right.reader.samples(WINDOW, 0.0, ["R_a"])]
     shutil.rmtree(state_directory())
-    computer = Computer(error=case.first)
+    computer = Computer(error=case.first, booted=NOW - case.uptime)
     running = daemons(computer)
     for index in range(COUNT):
         computer.error = case.then.get(index, computer.error + case.per_window)

@@ -6,8 +6,10 @@ only the wall clock can tell how long the computer was off. If it says something
 
 A wall clock that is set by :data:`MIN_SET` or more was wrong since the boot, or since the first daemon of this boot
 began: the labels of that time are corrected. A smaller correction is what a clock drifts by; earlier labels stay.
+A computer without a battery has a wrong clock at each boot until a time server answers, so that is no event.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -20,7 +22,10 @@ from otolith.health.labels import TimeLabels
 from otolith.storage.learned_state import SavedClock
 from otolith_drivers.common.clocks import clock_difference, uptime
 
+log = logging.getLogger(__name__)
+
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+TIME_SERVER_DELAY = 3600.0  # s since the boot within which a time server sets the clock
 MIN_SET = 30.0  # s: a larger change of the wall clock was a wrong clock, a smaller one its drift
 LABEL_TOLERANCE = 0.1  # s by which labels may differ from the wall clock
 MAX_SUSPENSION_ERROR = 1e-3  # s by which two comparisons of the clocks differ by chance
@@ -99,7 +104,10 @@ class ServiceClock:
         return self._offset + self._read().uptime
 
     def update(self) -> float | None:
-        """Follow the wall clock with the labels; return by how much it was set (s), or None if it was not."""
+        """Follow the wall clock with the labels.
+
+        Return by how much it was set (s); None if it was not, or so soon after the boot that it is no event.
+        """
         now = self._read()
         if abs(now.uptime - now.monotonic - self._suspended) > MAX_SUSPENSION_ERROR:
             self._suspended = now.uptime - now.monotonic
@@ -108,6 +116,9 @@ class ServiceClock:
             self.labels = self._labels_now(now)
             return None
         self.labels = self.labels.shifted(self._begin, by)
+        if now.uptime < TIME_SERVER_DELAY:
+            log.info("the clock was set by %+.0f s after the boot; times since the boot are corrected", by)
+            return None
         return by
 
     def _labels_now(self, now: ClockReading) -> TimeLabels:
