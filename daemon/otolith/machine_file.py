@@ -290,7 +290,8 @@ class MachineFile(StrictModel):
     @property
     def read_signals(self) -> dict[str, dict[str, Any]]:
         """The tables of ``[signals]`` of what a driver reads."""
-        return {name: table for name, table in self.signals.items() if name not in self.unmeasured}
+        unmeasured = self.unmeasured
+        return {name: table for name, table in self.signals.items() if name not in unmeasured}
 
 
 TEMPERATURE_UNIT = "K"
@@ -340,11 +341,12 @@ def driver_configs(file: MachineFile, twin: Definition, source: SourceFile) -> t
         context.fail(("driver",), f"missing: {remedy}")
     units = signal_units(file, twin)
     needed = list(units)
-    for name in file.read_signals:
+    read = file.read_signals
+    for name in read:
         if name not in needed:
             context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
     for name, unit in units.items():
-        if name not in file.read_signals:
+        if name not in read:
             reason = f"the twin needs {', '.join(twin.signals)}" if name in twin.signals else "[parameters] names it"
             if twin.ordinary_range(name) is not None:
                 reason += f'; if no sensor measures it, write {name} = {{ unknown = "constant" }}, "slow" or "friction"'
@@ -394,7 +396,7 @@ def _place(file: MachineFile, number: int) -> tuple[int | str, ...]:
 
 def _source_of(signal: str, file: MachineFile, names: Sequence[str], context: Context) -> str:
     """Return the name of the driver that reads ``signal``."""
-    written = file.read_signals[signal].get("source")
+    written = file.signals[signal].get("source")
     if written is None and len(names) == 1:
         return names[0]
     if written is None:
@@ -423,7 +425,7 @@ def _driver_config(
         Signal(
             signal,
             units[signal],
-            validate(own_keys(file.read_signals[signal]), module.Source, source, under=("signals", signal)),
+            validate(own_keys(file.signals[signal]), module.Source, source, under=("signals", signal)),
             twin.ordinary_range(signal),
         )
         for signal in signals

@@ -52,12 +52,12 @@ class TimeLabels:
         return time + self.ahead(time)
 
     def first(self, unix: float) -> float:
-        """Return the earliest service time from which a Unix time of ``unix`` or later is its label."""
+        """Return the earliest service time whose Unix time is ``unix`` or later."""
         reached = (max(begin, unix - ahead) for begin, end, ahead in self._pieces() if unix - ahead < end)
         return min(reached)
 
     def last(self, unix: float) -> float:
-        """Return the latest service time up to which a Unix time of ``unix`` or earlier is its label."""
+        """Return the latest service time whose Unix time is ``unix`` or earlier."""
         reached = (min(end, unix - ahead) for begin, end, ahead in self._pieces() if unix - ahead >= begin)
         return max(reached)
 

@@ -8,7 +8,7 @@ import logging
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 
 import zenoh
@@ -55,7 +55,7 @@ class _Session:
     endpoints: _Endpoints
     opened: zenoh.Session
     reports: zenoh.Publisher
-    declared: tuple[object, ...] = field(default=())
+    declared: tuple[object, ...]
 
 
 class Publisher:
@@ -167,9 +167,9 @@ class Publisher:
                     log.info("reports on %s as well", endpoints.text)
                 elif reason != before:
                     log.warning("no reports on %s: %s; it is tried again", endpoints.text, reason)
+                waiting = {**self._waiting, endpoints: reason}
                 with self._lock:
-                    self._waiting = {**self._waiting, endpoints: reason}
-                    self._waiting = {each: text for each, text in self._waiting.items() if text}
+                    self._waiting = {each: text for each, text in waiting.items() if text}
 
     def _open(self, endpoints: _Endpoints) -> None:
         """Open a session; raise what is in ``UNAVAILABLE``, or ConfigurationError."""

@@ -370,9 +370,8 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     """Return name, value and colour of the lines beside a parameter: nominal value and limits, the nearest first."""
     limits = sorted(quantity.limits, key=lambda row: abs(row.value - quantity.nominal))
     rows = [("nominal", quantity.nominal, LIMIT), *((str(row.level), row.value, STATES[row.level]) for row in limits)]
-    values = (quantity_text(value, quantity.unit, digits=4) for _, value, _ in rows)
-    named = zip(rows, values, strict=True)
-    return [(f"{texts.translated(name)} {shown}", value, colour) for (name, value, colour), shown in named]
+    say, unit = texts.translated, quantity.unit
+    return [(f"{say(name)} {quantity_text(value, unit, digits=4)}", value, colour) for name, value, colour in rows]
 
 
 def named_with_unit(name: str, unit: str) -> str:

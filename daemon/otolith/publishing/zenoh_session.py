@@ -174,9 +174,9 @@ def session(
 
 
 def protect_files() -> None:
-    """Let no other user write what this process makes, whoever started it; to be called before there are threads.
+    """Keep other users from writing the files that this process makes, whatever umask it was started with.
 
-    The umask belongs to the process: to change it for a moment would change the files that other threads make.
+    Call it before any thread starts: the umask belongs to the whole process, so it also holds for what threads make.
     """
     before = os.umask(OTHERS_WRITE)
     os.umask(before | OTHERS_WRITE)

@@ -23,22 +23,27 @@ def processor_time(pid: int) -> float:
 class Effort:
     """The time that counts since the begin of some work: that of the processor, and that of waiting without any.
 
-    Times of the clock are monotonic, s. Processor times are those of the present process, of several after another.
+    ``now`` is monotonic time, s. ``spent`` is the processor time of the process that runs now, s: if it becomes
+    smaller, another process has taken its place.
     """
 
     def __init__(self) -> None:
         self._counted = self._spent = self._advanced_at = self._seen_at = 0.0
 
     def begin(self, now: float, spent: float) -> None:
-        """Count from ``now`` on, when the process has taken the processor time ``spent`` (s)."""
+        """Count from ``now`` on."""
         self._counted, self._spent, self._advanced_at, self._seen_at = 0.0, spent, now, now
 
     def seconds(self, now: float, spent: float) -> float:
         """Return the time that counts until ``now``, s."""
         if spent != self._spent:
-            waited = self._seen_at - self._advanced_at
-            self._counted += (spent - self._spent if spent > self._spent else spent) + waited * (waited > MAX_TURN)
+            computed = spent - self._spent if spent > self._spent else spent
+            self._counted += computed + self._waited(self._seen_at)
             self._spent, self._advanced_at = spent, now
         self._seen_at = now
-        waited = now - self._advanced_at
-        return self._counted + waited * (waited > MAX_TURN)
+        return self._counted + self._waited(now)
+
+    def _waited(self, until: float) -> float:
+        """Return the time since the process last computed, s; 0 if it may only wait for its turn."""
+        waited = until - self._advanced_at
+        return waited if waited > MAX_TURN else 0.0

@@ -86,7 +86,7 @@ class _Inbox:
                     self._ready.send_bytes(b"")
             except (EOFError, OSError):  # it has ended
                 return
-            except Exception as error:  # noqa: BLE001 - of a message that is none: whoever waits for it has a timeout
+            except Exception as error:  # noqa: BLE001 - unpickling half a message may raise anything; its reader has a timeout
                 log.warning("%s: a message that cannot be read: %s", name, error)
 
 
@@ -172,10 +172,9 @@ class ChildProcess:
         """Arguments for :func:`multiprocessing.connection.wait`: ready on a reply, and when the process has died."""
         if not self.alive:
             return []
-        inbox = (
-            [] if self._inbox is None or not self._inbox.is_open else [self._inbox.ready]
-        )  # it stays ready at the end
-        return [self._process.sentinel, *inbox]
+        if self._inbox is None or not self._inbox.is_open:  # a closed one would always be ready
+            return [self._process.sentinel]
+        return [self._process.sentinel, self._inbox.ready]
 
     def may_restart(self, now: float) -> bool:
         """Return whether the process is dead and its restart pause is over; ``now`` is monotonic time, s."""

@@ -62,7 +62,7 @@ STALL_TIMEOUT = 30.0  # s of effort without a finished window, and three window 
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
-MAX_STATUS = 1000  # characters of a line for systemd; a longer one is cut, as a datagram that is too long is not sent
+MAX_STATUS = 1000  # characters of a line for systemd, beyond which it is cut: a datagram that is too long is not sent
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
 

@@ -185,12 +185,13 @@ def state_lines(document: ReportDocument) -> list[Text]:
     for name, part in health.parts.items():
         parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
-    told = current if len(current) > 1 else ()
-    lines = [Text(headline(health, local_time, told), style=LEVEL_STYLES[health.state]), parts]
+    is_in_headline = len(current) == 1  # several events have a line each instead
+    own_lines = () if is_in_headline else current
+    lines = [Text(headline(health, local_time, own_lines), style=LEVEL_STYLES[health.state]), parts]
     if undecided := undecided_text(document, local_time):
         lines.append(Text(undecided, style="bold magenta"))
     for event in current:
-        if told or event.state is not health.state:  # otherwise the first line has said so
+        if not is_in_headline or event.state is not health.state:
             what, since = f"{say(event.state)}: {say(event.part)}: {event.condition}", local_time(event.since)
             lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
