@@ -1,5 +1,6 @@
 """Whatever the wall clock does, no window is affected: values, intervals, onsets and the history are right."""
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
@@ -9,10 +10,15 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from benchmarks.discovery.motor import PERIOD, R_A, Faults, simulate_motor
+from click.testing import CliRunner
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions, restore_components
+from otolith.cli.main import cli
+from otolith.discovery.decision import AdoptedComponent
 from otolith.estimation.imm_filter import UNKNOWN_AWAY
+from otolith.estimation.problem import Component
 from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import History
 from otolith.health.schema import EventChange, EventDocument, ReportDocument
@@ -260,6 +266,43 @@ def test_a_boot_with_a_wrong_clock_keeps_the_begin_of_an_open_event(daemons: Sta
     assert (first.start, last.start) == (before.start, before.start)
     assert last.end == pytest.approx(computer.time - 3 * LENGTH, abs=3 * LENGTH)
     assert cleared
+
+
+def with_component(state: AdaptationState, onset: float) -> AdaptationState:
+    """The state with an additional torque that was found at a time of the windows."""
+    adopted = AdoptedComponent(Component("shaft", "constant", "", 0.004), onset)
+    return restore_components(state, (ComponentRecord(adopted, (0.004,), (1e-4,)),))
+
+
+@pytest.mark.parametrize("is_forgotten", [True, False])
+@pytest.mark.parametrize("error", [YEAR, -YEAR])
+def test_a_component_is_forgotten_if_it_was_found_before_the_operator_said_so(
+    error: float, is_forgotten: bool, daemons: Start
+) -> None:
+    """The first daemon began with a wrong clock, so its windows have other times than the operator."""
+    computer = Computer(error=error)
+    running = daemons(computer)
+    computer.error = 0.0
+    running.service._follow_wall_clock()
+    supervisor, found = running.service._supervisor, computer.time
+    supervisor.state = with_component(supervisor.state, running.service._clock.now())
+    running.run(1)
+    (key,) = {known.component.key for known in supervisor.state.adopted}
+    moment = found + 60.0 if is_forgotten else found - 60.0
+    running.service._store.save_decisions(OperatorDecisions(forgotten={key: moment}))
+    running.stop()
+    arguments = ["components", "list", str(running.machine.path)]
+    shown = [
+        CliRunner().invoke(cli, [*arguments, *options], standalone_mode=False, catch_exceptions=False).stdout
+        for options in ([], ["--json"])
+    ]
+    assert ("forgotten" in shown[0]) == is_forgotten
+    assert json.loads(shown[1])["components"][0]["adopted"]["onset"] == pytest.approx(found, abs=LABEL_TOLERANCE)
+    computer.time += 120.0
+    running.service = running._started()
+    adopted = running.service._supervisor.state.adopted
+    assert [known.component.key for known in adopted] == ([] if is_forgotten else [key])
+    running.stop()
 
 
 @pytest.mark.parametrize("error", [-NOW, HOUR, -YEAR])

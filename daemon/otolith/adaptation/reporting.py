@@ -138,7 +138,7 @@ class WindowResult:
         return 0 if self.is_accepted else state.contradictions + (self.decision is not WindowDecision.BAD)
 
     def noisier_since(self, state: AdaptationState) -> float | None:
-        """Return from when on more noise than stated is accepted, Unix seconds; None if none is."""
+        """Return from when on more noise than stated is accepted, service time in s; None if none is."""
         if self.decision is not WindowDecision.NOISIER or not self.posterior.problem.stated_noise:
             return state.noisier_since
         return self.test.onset if self.test else state.noisier_since or self.posterior.belief.end

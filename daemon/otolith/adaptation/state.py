@@ -14,6 +14,7 @@ from otolith.estimation.posterior import UNKNOWN_PHASE_SD, Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions, augment, indices, slot_of, without
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState
+from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import Baseline, with_baselines
 from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus
@@ -47,7 +48,7 @@ class AdaptationState:
     input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
     """What windows show of the noise of inputs for which none is stated."""
     noisier_since: float | None = None
-    """Unix seconds from which on more noise than stated is accepted; None if none is."""
+    """Service time in s from which on more noise than stated is accepted; None if none is."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
     """Limits and rules by which states and events follow from the reports."""
     health: HealthState = field(default_factory=HealthState)
@@ -135,16 +136,20 @@ class OperatorDecisions:
     approved: frozenset[str] = frozenset()  # They belong to the healthy machine
     rejected: frozenset[str] = frozenset()  # They are no components, and discovery leaves them out
     forgotten: Mapping[str, float] = field(default_factory=dict)
-    """Unix seconds: a component discovered before then has to be discovered again."""
+    """Unix seconds, or :meth:`in_service_time`: a component discovered before then has to be discovered again."""
     resets: Mapping[str, float] = field(default_factory=dict)
     """Unix seconds at which the operator reset a parameter, a component or everything, by name. Each is applied once.
     """
     baselines: Mapping[str, Baseline] = field(default_factory=dict)
     """Of the parameters; relative limits refer to them."""
 
+    def in_service_time(self, labels: TimeLabels) -> "OperatorDecisions":
+        """Return the decisions with ``forgotten`` on the clock of the windows; times of resets are only compared."""
+        return replace(self, forgotten={key: labels.last(time) for key, time in self.forgotten.items()})
+
 
 def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
-    """Return the state after the operator's decisions."""
+    """Return the state after the operator's decisions, whose ``forgotten`` is on the clock of the windows."""
     for name in sorted(decisions.resets):  # EVERYTHING comes first
         if state.resets.get(name) != decisions.resets[name]:
             state = _reset(state, name)

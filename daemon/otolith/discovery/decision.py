@@ -203,7 +203,7 @@ class AdoptedComponent:
     """A component in the twin, with its history."""
 
     component: Component
-    onset: float  # Unix seconds
+    onset: float  # Service time, s
     probability: float = 1.0  # When it was adopted
     approval: Approval = Approval.OPEN
     alternatives: tuple[Alternative, ...] = ()

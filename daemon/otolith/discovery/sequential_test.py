@@ -137,7 +137,7 @@ class SequentialTest:
 
     problem: Problem  # Of the filter, without what the hypotheses add
     hypotheses: tuple[TrackedHypothesis, ...]  # The best first
-    onset: float  # Unix seconds
+    onset: float  # Service time, s
     last: FitSummary = FitSummary()  # Of the last window
     counts: WindowCounts = WindowCounts()
     filter_evidence: FilterEvidence = FilterEvidence()

@@ -29,8 +29,8 @@ MAX_AGE = 600.0  # s for which a component over time that is not periodic is kep
 class PhaseAdvance:
     """How far the sources of the components moved from the first record of a window to that of the next."""
 
-    start: float  # Unix seconds of the window's first record
-    next_start: float  # Unix seconds of the next window's first record, if no window is missing between
+    start: float  # Service time of the window's first record, s
+    next_start: float  # That of the next window's first record, if no window is missing between
     by: tuple[float, ...]  # Of each slot, in the unit of its source
     last_state: tuple[float, ...] = ()  # State of the twin at the last record of the window; empty if it is not known
 
@@ -224,10 +224,10 @@ class Posterior:
         return self if steps == self.problem.steps else replace(self, problem=replace(self.problem, steps=steps))
 
     def without_expired(self, start: float) -> "Posterior":
-        """Return what is known without components over time that are not periodic and too old at ``start`` (Unix s).
+        """Return what is known without components over time that are not periodic and too old at ``start``.
 
-        What lasts longer is a trend of a parameter. A component from the future means that the clock was set back; it
-        leaves as well.
+        ``start`` is a service time, s. What lasts longer is a trend of a parameter. A component from the future means
+        that a log begins again; it leaves as well.
         """
         posterior = self
         for component in self.problem.components:
@@ -274,7 +274,7 @@ def _advance_phase(belief: ImmPosterior, problem: Problem, slot: int, by: float)
 
 
 def _stays_coherent(belief: ImmPosterior, problem: Problem, slot: int, elapsed: float) -> bool:
-    """Whether the frequency is known well enough to predict the phase; never if the clock was set back."""
+    """Whether the frequency is known well enough to predict the phase; never if a log begins again."""
     inner = indices(problem, slot)[1]
     sd = float(np.sqrt(belief.covariance[:, inner, inner].max())) * problem.scale[inner]
     return elapsed >= 0.0 and sd * elapsed < UNKNOWN_PHASE_SD

@@ -51,7 +51,7 @@ class Component:
     high: float = 0.0  # Upper bound of the inner parameter
     amplitude_low: float = -UNLIMITED  # Lower bound of the amplitude, in the unit of the site
     amplitude_high: float = UNLIMITED  # Upper bound of the amplitude
-    origin: float = 0.0  # Unix seconds at which a source t that is not periodic counts zero
+    origin: float = 0.0  # Service time in s at which a source t that is not periodic counts zero
 
     @property
     def key(self) -> str:

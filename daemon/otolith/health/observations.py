@@ -59,7 +59,7 @@ class Observation:
     features: FindingFeatures = NOTHING
     text: str = ""
     advice: str = ""  # Beside that of the rules
-    since: float | None = None  # Unix seconds; None for the first window that shows it
+    since: float | None = None  # Service time, s; None for the first window that shows it
     numbers: Mapping[str, float | str] | None = None  # For the evidence of the event
     persistence: Persistence = Persistence()
 

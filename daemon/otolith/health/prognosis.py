@@ -77,7 +77,7 @@ class Trend:
     """The posterior of the models of a history."""
 
     family: str  # linear or exponential: the one with more evidence
-    now: float  # Time of the last point, Unix s
+    now: float  # Time of the last point, s
     span: float  # See span
     cells: _Cells
 
@@ -310,7 +310,7 @@ class Baseline:
     value: float
     sd: float
     windows: int  # Number of estimates that it is the mean of
-    end: float  # Time of the last of them, Unix s
+    end: float  # Service time of the last of them, s
 
 
 def baselines(histories: Mapping[str, History]) -> dict[str, Baseline]:

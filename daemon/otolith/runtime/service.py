@@ -26,7 +26,14 @@ from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
-from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_problem, with_sample_grid
+from otolith.adaptation.state import (
+    AdaptationState,
+    OperatorDecisions,
+    apply_decisions,
+    initial_state,
+    with_problem,
+    with_sample_grid,
+)
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.labels import clock_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
@@ -287,7 +294,7 @@ class Service:
         state = with_problem(state, replace(state.problem, changing=changing))
         notes = [note] if note else []
         try:
-            state = apply_decisions(state, self._store.decisions())
+            state = self._decided(state, self._store.decisions())
         except OtolithError as error:
             notes.append(f"started without the operator's decisions: {error}")
         for text in notes:
@@ -300,6 +307,9 @@ class Service:
             names = ", ".join(known.component.key for known in state.adopted)
             log.info("started with saved components: %s; %s", names, remedy)
         return state
+
+    def _decided(self, state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
+        return apply_decisions(state, decisions.in_service_time(self._clock.labels))
 
     def _start_history(self) -> None:
         if self._history is not None:
@@ -324,7 +334,7 @@ class Service:
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             # The decisions contain the baselines to which limits in percent refer.
-            self._supervisor.revise(lambda state: apply_decisions(replace(state, plan=change.machine.plan), decisions))
+            self._supervisor.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
         if change.recording:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
@@ -351,7 +361,7 @@ class Service:
         self._adopt_achieved_period(link.period)
         decisions = self._writer.new_decisions()
         if decisions is not None:
-            self._supervisor.revise(lambda state: apply_decisions(state, decisions))
+            self._supervisor.revise(lambda state: self._decided(state, decisions))
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
         absent = absent_sources(link, window, self._outputs)

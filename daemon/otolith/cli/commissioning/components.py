@@ -57,17 +57,19 @@ def list_(file: Path, as_json: bool) -> None:
     from otolith.adaptation.state import ComponentRecord
 
     machine, store = _store(file)
-    records, decisions = store.components(), store.decisions()
+    decisions, labels = store.decisions(), store.labels()
+    records = [
+        replace(record, adopted=replace(record.adopted, onset=labels.unix(record.adopted.onset)))
+        for record in store.components()
+    ]
     if as_json:
         rows = [TypeAdapter(ComponentRecord).dump_python(record, mode="json") for record in records]
         keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
         echo_json({"components": rows, **keys})
         return
-    labels = store.labels()
     for record in records:
-        onset = labels.unix(record.adopted.onset)
-        decision = _decision(record, decisions)
-        echo(f"{_key(record)}  {_equation(machine, record)}  since {local_time(onset)}  {decision}")
+        onset, decision = local_time(record.adopted.onset), _decision(record, decisions)
+        echo(f"{_key(record)}  {_equation(machine, record)}  since {onset}  {decision}")
     for key in sorted(decisions.rejected - {_key(record) for record in records}):
         echo(f"{key}  rejected: not searched for")
     if not records and not decisions.rejected:
