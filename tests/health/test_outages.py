@@ -6,8 +6,8 @@ from otolith.discovery.decision import WindowDecision
 from otolith.health.events import HealthState
 from otolith.health.limits import Level
 from otolith.health.observations import DAEMON, PERSISTENT_WINDOWS
-from otolith.health.schema import EventChange, ReportDocument
-from tests.health.test_events import assessed, changes, report
+from otolith.health.schema import EventChange, FindingKind, ReportDocument
+from tests.health.test_events import SENSOR, assessed, changes, report
 
 REASON = "/var/lib/otolith: cannot be created: Read-only file system"
 
@@ -44,6 +44,18 @@ def test_a_day_on_which_everything_works_has_no_part_for_it() -> None:
     documents = assessed([report(index) for index in range(10)])
     assert all(document.health and DAEMON not in document.health.parts for document in documents)
     assert changes(documents) == []
+
+
+def test_an_outage_hides_no_fault_of_the_machine_that_comes_and_goes() -> None:
+    doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": ""})
+    reports = [
+        report(index, decision=WindowDecision.SUSPECTED, findings=(doubt,)) if index % 5 < 2 else report(index)
+        for index in range(10, 60)
+    ]
+    expected = [change for change in changes(assessed(reports)) if change[1] is EventChange.RAISED]
+    documents = assessed([with_outages(document, "recording") for document in reports])
+    assert len(expected) == 1
+    assert expected[0] in changes(documents)
 
 
 def test_an_outage_that_is_over_at_once_is_no_event() -> None:

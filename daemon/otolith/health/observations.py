@@ -125,7 +125,8 @@ def _of_returns(
     key, once, features = "returns", Persistence(rise=1, fall=1), FindingFeatures(FindingKind.RETURNS, report.twin)
     begins = [index for index in doubtful if index - 1 not in doubtful]
     is_shown = len(begins) >= MIN_RETURNS and doubtful[-1] == report.window.index
-    if not is_shown or any(level is not Level.OK for name, level in before.items() if name != key):
+    of_machine = [level for name, level in before.items() if name != key and not name.startswith(OUTPUT)]
+    if not is_shown or any(level is not Level.OK for level in of_machine):
         return Observation(key, MACHINE, None if doubtful else Level.OK, features, persistence=once)
     seconds = (report.window.end - report.window.start) * (doubtful[-1] - begins[0] + 1)
     causes = next((item.text for item in report.findings if item.kind is not FindingKind.COMPONENT), "")

@@ -289,7 +289,7 @@ def bundles_of(site: str, machine: str) -> dict[str, Path]:
 
 
 def stamp_of(end: float) -> str:
-    """Return the time in the name of the bundle of a window that ends at ``end`` (Unix s)."""
+    """Return the time in the name of the bundle of a window that ends at ``end`` (service time, s)."""
     return datetime.fromtimestamp(end, UTC).strftime(STAMP)
 
 
