@@ -121,6 +121,14 @@ def test_what_does_not_fit_is_refused(name: str, driven: str, kind: Assumption, 
         without_sensor(find_twin(name), UnmeasuredInput(driven, kind, expression))
 
 
+def test_an_input_that_the_twin_does_not_have_is_named() -> None:
+    """As in a bundle of evidence that somebody has changed."""
+    item = UnmeasuredInput("T_load", Assumption.CONSTANT)
+    without = without_sensor(find_twin("dc_motor"), item)
+    with pytest.raises(ValueError, match="T_load"):
+        without_sensor(without, item)
+
+
 def test_without_a_range_there_is_no_scale() -> None:
     twin = find_twin("dc_motor")
     unstated = replace(twin, inputs=tuple(replace(row, has_range=False) for row in twin.inputs))

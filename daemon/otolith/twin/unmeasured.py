@@ -71,10 +71,11 @@ def without_sensor(definition: Definition, item: UnmeasuredInput) -> Definition:
     """Return the twin with an input replaced by what is assumed of it.
 
     Raises:
-        ValueError: the assumption does not fit the equations, or the twin states no range of the input.
-        StopIteration: the twin has no such input.
+        ValueError: the twin has no such input or states no range of it, or the assumption does not fit the equations.
     """
-    driven = next(row for row in definition.inputs if row.name == item.name)
+    driven = next((row for row in definition.inputs if row.name == item.name), None)
+    if driven is None:
+        raise ValueError(f"the twin has no input {item.name}")
     if not driven.has_range:
         raise ValueError(f"the twin states no range of {driven.name}: write one in its file, like range = [-5, 5]")
     rest = replace(definition, inputs=tuple(row for row in definition.inputs if row is not driven))
