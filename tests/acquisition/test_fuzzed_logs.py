@@ -376,7 +376,7 @@ def test_any_log_gives_finite_reports_at_a_bounded_cost(log: Log, tmp_path_facto
 
 @pytest.mark.full
 @given(log=logs())
-@settings(max_examples=300, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=600, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 def test_many_logs_give_finite_reports_at_a_bounded_cost(log: Log, tmp_path_factory: Folders, work: Work) -> None:
     replayed(log, tmp_path_factory.mktemp("log"), work)
 

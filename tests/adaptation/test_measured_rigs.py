@@ -19,7 +19,7 @@ from tests.variants import often, often_rows
 
 PERIOD, RECORDS, SUBSTEPS = 0.02, 100, 20
 WINDOWS, FEW = 14, 6
-SEEDS = pytest.mark.parametrize("seed", often([1], range(1, 5)))
+SEEDS = pytest.mark.parametrize("seed", often([1], range(1, 9)))
 EXCITATIONS = pytest.mark.parametrize("excitation", often(["steps"], ["sine", "steps", "stops"]))
 TRUTH = {"K": 0.046, "J": 6e-5, "T_c": 0.009}  # of the motor
 RESISTANCE = 2.0  # ohm

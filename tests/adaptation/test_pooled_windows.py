@@ -59,7 +59,7 @@ def test_windows_together_adopt_what_none_of_them_shows(seed: int, stated: float
     assert component.probability > 0.99
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 4))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 10))])
 @pytest.mark.parametrize("stated", often([MORE_NOISE], [1.0, MORE_NOISE]))
 def test_a_healthy_axis_whose_load_wanders_adopts_nothing(seed: int, stated: float) -> None:
     """Its encoder has steps, and its controller responds to them."""

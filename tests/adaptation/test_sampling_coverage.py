@@ -57,11 +57,11 @@ def test_windows_are_estimated_with_valid_intervals_near_the_bound(case: str) ->
 
 @pytest.mark.full
 @pytest.mark.parametrize("case", FULL)
-def test_250_windows_are_estimated_with_valid_intervals_near_the_bound(case: str) -> None:
-    assert_valid_and_efficient(measured(CASES[case], windows=250, seed=1))
+def test_500_windows_are_estimated_with_valid_intervals_near_the_bound(case: str) -> None:
+    assert_valid_and_efficient(measured(CASES[case], windows=500, seed=1))
 
 
-@pytest.mark.parametrize(("windows", "cases"), [(40, SHORT), pytest.param(250, FULL, marks=pytest.mark.full)])
+@pytest.mark.parametrize(("windows", "cases"), [(40, SHORT), pytest.param(500, FULL, marks=pytest.mark.full)])
 def test_intervals_of_all_scenarios_hold_the_truth_in_95_percent(windows: int, cases: tuple[str, ...]) -> None:
     """The published intervals may be wider: they allow for parameters that drift."""
     summaries = [measured(CASES[case], windows=windows, seed=1) for case in cases]

@@ -66,7 +66,7 @@ def sine_windows(seed: int) -> list[Window]:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(10))
 def test_stiction_is_neither_a_delay_nor_another_inertia(tmp_path: Path, seed: int) -> None:
     file = tmp_path / "stiction.toml"
     file.write_text(TWIN, encoding="utf-8")

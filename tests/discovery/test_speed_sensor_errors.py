@@ -17,7 +17,7 @@ SUBSTEPS = 10
 BOTH, ONE = ("i", "omega"), ("omega",)
 EQUAL = 0.03  # difference of probabilities; small ones are not stated
 UNBALANCE = "shaft/periodic/angle(omega)"
-SEEDS = pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 4))])
+SEEDS = pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 7))])
 ERRORS = pytest.mark.parametrize(
     ("ripple", "eccentricity"), [(RIPPLE, 0.0), (0.0, ECCENTRICITY)], ids=("ripple", "eccentric")
 )
