@@ -84,7 +84,7 @@ def gain_error(random: np.random.Generator, plant: Plant, rows: dict[str, Array]
     rows["T_load"] *= 1.2
 
 
-@pytest.mark.parametrize("disturb", [late_at_first, gain_error])
+@pytest.mark.parametrize("disturb", often([gain_error], [late_at_first, gain_error]))
 def test_an_error_of_a_load_with_fast_changes_is_no_noise(disturb: Disturbance) -> None:
     """A delay that ends leaves nothing in the sums. A gain error changes the torque by its fast changes, too."""
     plant = replace(TWO_MASS, operate=rough_operation)
@@ -117,6 +117,7 @@ def later_noise(random: np.random.Generator, plant: Plant, rows: dict[str, Array
     rows["T_load"] += noise
 
 
+@pytest.mark.full
 def test_noise_that_begins_later_has_the_right_level() -> None:
     """Thirty calm windows before it do not lower the level."""
     case = Case("later", TWO_MASS, HEALTHY, healthy=60, changed=0, disturb=later_noise)

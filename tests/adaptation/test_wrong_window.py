@@ -80,7 +80,7 @@ def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument
     return documents
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
+@pytest.mark.parametrize("wrong", often(WRONG[:2], WRONG), ids=lambda wrong: wrong.__name__)
 @pytest.mark.parametrize(
     "free", often([("R_a", "L_a", "J", "D")], [("R_a",), ("R_a", "D"), ("R_a", "L_a", "J", "D")]), ids=len
 )

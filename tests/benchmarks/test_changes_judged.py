@@ -200,6 +200,7 @@ def moved_by(drawn: calibration.Drawn) -> float:
     return max(float(np.sqrt(np.mean((changed[own.name] - right[own.name]) ** 2))) / own.noise for own in outputs)
 
 
+@pytest.mark.full
 def test_drawn_cases_are_reproducible_and_of_all_kinds() -> None:
     drawn = [drawn_case(number) for number in range(40)]
     assert calibration.draw(5, 1) == drawn[5]

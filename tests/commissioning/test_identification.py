@@ -87,7 +87,7 @@ def test_process_noise_beside_sensor_noise(process: tuple[float, float], seed: i
     assert noise.consistency.factor == 1.0
 
 
-@pytest.mark.parametrize("process", [1e-3, 4e-3])
+@pytest.mark.parametrize("process", often([1e-3], [1e-3, 4e-3]))
 def test_a_level_far_below_its_first_guess_is_found_with_few_fits(process: float) -> None:
     """The first guess shows from record to record: at 1 kHz it is a hundred times what windows show as a whole."""
     twin, random, period, records = find_twin("servo_axis"), np.random.default_rng(4), 1e-3, 1000

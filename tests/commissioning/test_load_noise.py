@@ -43,6 +43,7 @@ def test_identified_noise_makes_intervals_right_under_load_noise(machine: Ageing
     assert np.mean(list(shares.values())) >= 0.93
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("machine", LOADED, ids=lambda machine: machine.plant.name)
 def test_intervals_are_too_narrow_if_nothing_states_the_noise_of_the_load(machine: Ageing) -> None:
     """The innovations of each window are too few to show it: noise must be identified."""

@@ -82,6 +82,7 @@ def test_the_error_of_the_integrator_is_no_evidence(number: int) -> None:
     assert parameter == pytest.approx(sensor, abs=1.0)
 
 
+@pytest.mark.full
 def test_a_simple_cause_is_compared_beside_a_shape_that_fits_the_error_of_the_linear_response() -> None:
     """Force reads 10 % too much, 9.1 % of the reading: that is stated beside the parameters that it resembles."""
     case = Case("gain of F", SERVO_AXIS, Change(gains={"F": 1.1}), healthy=5, changed=2)

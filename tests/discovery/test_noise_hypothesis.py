@@ -61,6 +61,7 @@ def test_a_noisier_sensor_is_named_and_windows_are_learned(names: tuple[str, ...
     assert resistance.value == pytest.approx(6.5, abs=4.0 * (resistance.sd or 0.0))
 
 
+@pytest.mark.full
 def test_smooth_errors_are_no_noise() -> None:
     windows = noisier(simulated("steps", 14, Faults()), {"omega": 3.0}, smooth=8)
     state, documents = run(initial("R_a", "D"), windows)

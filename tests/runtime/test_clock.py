@@ -31,6 +31,7 @@ from otolith_drivers.common.clocks import clock_difference, wall_clock_offset
 from otolith_drivers.user_dirs import state_directory
 from tests.conftest import EXAMPLES
 from tests.runtime.motors import RECORDS, windows
+from tests.variants import often
 
 NOW = 1_795_000_000.0  # Unix s
 LENGTH = RECORDS * PERIOD
@@ -160,6 +161,7 @@ class Case:
 
 
 WRONG, RIGHT = 10, 13  # windows with an open event from which on the wall clock is wrong, and right again
+OFTEN = ("1970, then right", "+1 h, then right", "set while the event is cleared", "a drift of 100 ppm")
 CASES = {
     "right": Case(0.0),
     "boots in 1970, then right": Case(-NOW, {WRONG: 0.0}, uptime=20.0),
@@ -188,7 +190,7 @@ def of_limit(events: Sequence[EventDocument]) -> list[EventDocument]:
     return [event for event in events if event.id.startswith("limit/")]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", often(OFTEN, CASES))
 def test_no_window_is_affected_by_the_wall_clock(name: str, daemons: Start) -> None:
     """The table of clocks in docs/service.md: value, interval, onset and history."""
     case, right = CASES[name], daemons(Computer())

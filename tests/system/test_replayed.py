@@ -53,6 +53,7 @@ def replayed(*arguments: object) -> list[ReportDocument]:
     return [ReportDocument.from_json(line) for line in printed.splitlines()]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("transport", ["in-process", pytest.param("can", marks=(pytest.mark.full, pytest.mark.timed))])
 def test_the_daemons_recording_replays_to_the_same_reports(transport: str, tmp_path: Path) -> None:
     """On a busy computer only the plant in the daemon's process has no jitter, which would move the windows."""
