@@ -12,9 +12,9 @@ PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constra
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
-	@echo "make test    run the tests, long ones left out: four minutes on two cores"
+	@echo "make test    run the tests, long ones left out: six minutes on two cores"
 	@echo "make test-full"
-	@echo "             the long tests, and those that time something, one at a time: twenty minutes"
+	@echo "             the long tests, and those that time something, one at a time: half an hour"
 	@echo "make system-test"
 	@echo "             as root on Debian: drivers against can-utils, systemd and libmodbus, in a guest that is booted"
 	@echo "make check   ruff, mypy --strict, import rules"
