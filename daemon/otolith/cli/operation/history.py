@@ -1,12 +1,12 @@
 """``otolith history``, ``report`` and ``reproduce``: what was estimated and announced, and its computation again."""
 
 import json
+import math
 import os
 import re
-import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ SPANS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 INTERVALS = ("window", "minute", "hour", "day")
 # Engineering choices, see docs/reference/thresholds-cli.md.
 LONGEST = {"window": 7200.0, "minute": 2 * 86_400.0, "hour": 60 * 86_400.0}  # s that are shown at a resolution
-MAX_EVENTS = 20  # in the table
+MAX_EVENTS = 20  # in the table below the values
 MIN_CURVE = 8  # characters of a curve
 OTHER_COLUMNS = 46  # characters that the table needs beside it, names and units
 RANGE_COLUMNS = 24  # characters of its columns min and max
@@ -64,7 +64,8 @@ def age_or_date(_: click.Context, __: click.Parameter, text: str) -> Since:
 @click.option("--parameter", "names", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
 @click.option("--every", type=click.Choice(INTERVALS), show_default=False,
               help="Values of each window, minute, hour or day.  [default: as --since needs]")  # fmt: skip
-@click.option("--events", "only_events", is_flag=True, help="Only events with their evidence, and findings.")
+@click.option("--events", "only_events", is_flag=True, help="Only events.")
+@click.option("--details", is_flag=True, help="Each change of an event with its evidence, and findings, in sentences.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the values, or the events, as CSV.")
 @AS_JSON
 @click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
@@ -74,6 +75,7 @@ def history(
     names: tuple[str, ...],
     every: str | None,
     only_events: bool,
+    details: bool,
     as_csv: bool,
     as_json: bool,
     parquet: Path | None,
@@ -113,8 +115,7 @@ def history(
     elif as_json:
         _print_json(reader, interval, begin, samples, events)
     else:
-        bundles = _bundles(reader, begin) if only_events else {}
-        _print_table(reader, interval, begin, samples, events, bundles, with_findings=only_events or not names)
+        _print_table(reader, interval, begin, samples, events, details=details, has_findings=only_events or not names)
 
 
 def reader_of(machine: str) -> "HistoryReader":
@@ -260,13 +261,13 @@ def _print_table(
     since: float,
     samples: "Sequence[HistorySample]",
     events: "Sequence[EventDocument]",
-    bundles: "Mapping[int | None, Path]",
     *,
-    with_findings: bool,
+    details: bool,
+    has_findings: bool,
 ) -> None:
     from otolith.cli.console import Terminal
-    from otolith.cli.operation.live_table import event_style
-    from otolith.health.text import event_text
+    from otolith.cli.operation.event_table import event_table, print_changes, print_findings
+    from otolith_drivers.errors import counted
 
     console = Terminal(highlight=True)
     first = min((sample.time for sample in samples), default=since)
@@ -274,16 +275,19 @@ def _print_table(
     console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}{values}")
     if samples:
         console.print(_table(samples, console.width))
-    for event in events[-MAX_EVENTS:]:
-        change = "" if event.end is not None else f"{event.change}: "  # the text of a cleared event begins with it
-        console.print(f"{change}{event_text(event, local_time)}", style=event_style(event))
-        if (bundle := bundles.get(event.sequence)) is not None:
-            echo(f"  otolith reproduce {shlex.quote(str(bundle))}")
-    if len(events) > MAX_EVENTS:
-        console.print(f"and {len(events) - MAX_EVENTS} earlier changes of events: --events --csv has them")
-    for finding in reader.findings(since) if with_findings else ():
-        span = f"{local_time(finding['first'])} to {local_time(finding['last'])}"
-        console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows")
+    findings = reader.findings(since) if has_findings else []
+    if details:
+        print_changes(console, events, _bundles(reader, since))
+        print_findings(console, findings)
+    else:
+        newest = MAX_EVENTS if samples else None
+        if events:
+            console.print(event_table(events, console.width, newest))
+        earlier = len({event.id for event in events}) - (newest or math.inf)
+        if earlier > 0:
+            console.print(f"{counted(int(earlier), 'earlier event')}: see --events")
+        if findings:
+            console.print(f"{counted(len(findings), 'finding')}: see --details")
     if not samples and not events:
         echo("no values or events since then", err=True)
 
