@@ -32,7 +32,7 @@ class _EventRow:
 
 
 def event_table(changes: Iterable[EventDocument], width: int, newest: int | None = None) -> Table:
-    """Return a table with begin, state, part, cause and end of each event of which there are ``changes``, by their begin.
+    """Return a table with begin, state, part, cause and end of each event of ``changes``, by their begin.
 
     The state is the most severe one that the event reached. With ``newest`` only so many rows. Times are local; those
     of another zone than the first name it.
