@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.health.labels import MAX_SPANS, TimeLabels, clock_event
+from otolith.health.labels import MAX_SPANS, TimeLabels, clock_event, expiry_event
 from otolith.health.limits import Level
 from otolith.health.schema import (
     CrossingDocument,
@@ -20,6 +20,7 @@ from otolith.health.schema import (
     ReportDocument,
 )
 from otolith.health.text import event_text
+from tests.messages import assert_says
 from tests.storage.histories import START, document
 
 TIME = st.floats(-1e9, 1e9).map(lambda value: round(value, 3))
@@ -95,3 +96,10 @@ def test_the_event_of_a_clock_that_was_set_says_by_how_much() -> None:
     assert "+3600 s" in event_text(event)
     assert "+3600 s" in event_text(clock_event(START, 3600.0, 7, "de"))
     assert "-31536000 s" in event_text(clock_event(START, -31_536_000.0, 7, "en"))
+
+
+def test_the_event_of_a_certificate_names_it_and_its_end_in_each_language() -> None:
+    for language in ("en", "de"):
+        event = expiry_event(START, "press.crt", "2027-01-31", 7, language)
+        assert (event.change, event.end, event.state, event.part) == (EventChange.NOTED, START, Level.OK, "daemon")
+        assert_says(event_text(event), "press.crt", "2027-01-31")

@@ -15,7 +15,7 @@ from otolith.cli.demo import _refuse_busy
 from otolith.cli.main import cli
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import NOTICE_DAYS, Publisher
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import (
     SOCKET,
@@ -130,7 +130,7 @@ def damage(site: Path, name: str) -> None:
         ("encrypted", 6, r"zenoh\.tls\.key: .*press\.key: encrypted; Zenoh needs a key without a passphrase"),
         ("other key", 6, r"zenoh\.tls\.key: .*press\.key: does not belong to the certificate"),
         ("other authority", 5, r"zenoh\.tls\.certificate: .*press\.crt: was not issued by .*ca\.crt"),
-        ("expired", 5, r"zenoh\.tls\.certificate: .*press\.crt: expired on \d{4}-\d\d-\d\d; 'otolith keys add'"),
+        ("expired", 5, r"zenoh\.tls\.certificate: .*press\.crt: expired on \d{4}-\d\d-\d\d; 'otolith keys renew'"),
         ("early", 5, r"zenoh\.tls\.certificate: .*press\.crt: valid only from .*; check the clock"),
     ],
 )
@@ -176,6 +176,9 @@ def test_a_daemon_that_runs_for_years_warns_of_its_certificate(site: Path, caplo
         for hours in range(48):
             publisher.warn_of_expiry(utc_now() + timedelta(days=CERTIFICATE_DAYS - 20, hours=hours))
         assert caplog.text.count("own.crt: expires on ") in {2, 3}
+        notices = [publisher.expiry_notice(utc_now() + timedelta(days=days)) for days in range(CERTIFICATE_DAYS + 9)]
+        noticed = [day for day, notice in enumerate(notices) if notice]
+        assert noticed == [CERTIFICATE_DAYS - before for before in NOTICE_DAYS]
         publisher.warn_of_expiry(utc_now() + timedelta(days=CERTIFICATE_DAYS + 1))
         assert "own.crt: expired on " in caplog.text
     finally:

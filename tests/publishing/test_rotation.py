@@ -1,161 +1,168 @@
-"""Rotation of recordings in simulated time: nothing is lost between files, and each file can be used alone."""
+"""A certificate is replaced by another for the same name while readers are connected, without a restart."""
 
-import os
-import shutil
-import warnings
-from collections import namedtuple
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from datetime import timedelta
 from pathlib import Path
 
-import numpy as np
-import psutil
 import pytest
-from rerun.chunk import RrdReader
+from click.testing import CliRunner, Result
 
-from otolith.health.schema import EventChange, Report
-from otolith.machine import LoadedMachine, RecordedMachine, load_machine
-from otolith.publishing.recorder import CHECK_INTERVAL, RotatedRecording
-from otolith.storage.recording_files import DAY, RecordingBudget, RecordingFolder
-from otolith_drivers.base import Sampling
-from otolith_drivers.replay.recording import RecordingReader
-from tests.cli.replays import MACHINE
-from tests.health.test_events import assessed, report
-from tests.publishing.test_recording_size import BEGIN, LENGTH, UNITS, noise
+from otolith.cli.main import cli
+from otolith.machine_file import AccessTable, TlsTable, ZenohTable
+from otolith.publishing import certificates, publisher
+from otolith.publishing.certificates import (
+    CERTIFICATE_DAYS,
+    make_authority,
+    make_certificate,
+    renew_certificate,
+    utc_now,
+)
+from otolith.publishing.publisher import Publisher
+from otolith.publishing.zenoh_config import Access, Credentials
+from otolith_drivers.errors import ConfigurationError
+from tests.conftest import free_port
+from tests.messages import raises_saying
+from tests.publishing.test_security import EXPECTED, Reader
+from tests.waiting import wait_for
 
-Usage = namedtuple("Usage", ["total", "used", "free"])
+OLD = timedelta(days=CERTIFICATE_DAYS - 20)  # since it was made: it is valid for 20 days
 
 
-@pytest.fixture(scope="module")
-def machine() -> LoadedMachine:
-    return load_machine(MACHINE, with_driver=False)
+@pytest.fixture(autouse=True)
+def _often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publisher, "RENEWAL_INTERVAL", 0.05)
+    monkeypatch.setattr(publisher, "FIRST_RETRY", 0.05)
 
 
 @pytest.fixture
-def source(machine: LoadedMachine) -> RecordedMachine:
-    return machine.recorded(Sampling.TRUE)
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as opened:
+        yield opened
 
 
-def folder_of(tmp_path: Path, **changed: float) -> RecordingFolder:
-    budget = {"max_bytes": 1e9, "max_age": DAY, "rotate_bytes": 1e9, "rotate_age": 60.0, **changed}
-    return RecordingFolder(tmp_path / "recordings", "site.motor", RecordingBudget(**budget))
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """A folder with an authority, and certificates of a daemon and of a reader that expire soon."""
+    make_authority(tmp_path, utc_now())
+    make_certificate(tmp_path, "press", ["localhost", "127.0.0.1"], utc_now() - OLD)
+    make_certificate(tmp_path, "operator", [], utc_now() - OLD)
+    (tmp_path / "machine.toml").write_text('[zenoh.tls]\nca = "ca.crt"\ncertificate = "press.crt"\nkey = "press.key"\n')
+    return tmp_path
 
 
-def recorded(folder: RecordingFolder, source: RecordedMachine, reports: list[Report]) -> None:
-    recording = RotatedRecording(folder.new_path(BEGIN), source, folder, BEGIN)
-    for one in reports:
-        recording.add(one, one.document.window.end)
-        assert recording.has_room(one.document.window.end)
-    recording.close()
+def access(site: Path, *readers: str) -> Access:
+    tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
+    return Access(ZenohTable(tls=tls, access=AccessTable(readers=readers)), site / "machine.toml")
 
 
-def omega(path: Path) -> np.ndarray:
-    with RecordingReader(path, UNITS) as reader:
-        assert reader.warnings() == []  # it is complete
-        return np.concatenate([part.columns["omega"] for part in reader.chunks()])
+def keys(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["keys", *map(str, arguments)], catch_exceptions=False)
 
 
-def test_nothing_is_lost_between_files_and_each_is_complete(tmp_path: Path, source: RecordedMachine) -> None:
-    """100 windows of 2 s, a file per minute."""
-    folder, reports = folder_of(tmp_path), list(noise(100))
-    recorded(folder, source, reports)
-    files = sorted(file.path for file in folder.files())
-    assert len(files) == 4
-    measured = np.concatenate([one.traces.measured[:, 1] for one in reports])
-    assert np.array_equal(np.concatenate([omega(path) for path in files]), measured)
-    for path in files:
-        assert len(RrdReader(path).blueprints()) == 1
-        assert [entry.recording_id for entry in RrdReader(path).recordings()] == ["motor_site"]
+def credentials(site: Path, name: str) -> Credentials:
+    return Credentials(site / "ca.crt", site / f"{name}.crt", site / f"{name}.key")
 
 
-def test_a_file_of_the_largest_size_is_followed_by_another(tmp_path: Path, source: RecordedMachine) -> None:
-    folder = folder_of(tmp_path, rotate_age=DAY, rotate_bytes=4e5)
-    recorded(folder, source, list(noise(120)))
-    sizes = [file.size for file in folder.files()]
-    assert len(sizes) >= 3
-    assert max(sizes) < 8e5  # by up to a batch of windows larger
+def test_old_and_new_certificate_of_a_name_read_until_the_name_is_revoked(site: Path, stack: ExitStack) -> None:
+    """docs/security.md: 'Renew a certificate' and 'Exclude a reader'."""
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
+    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    renewal = renew_certificate(site, "operator", [], utc_now())
+    old = Reader(endpoint, credentials(site, renewal.kept.stem))
+    stack.callback(old.session.close)
+    assert old.receives(daemon) == EXPECTED
+    new = Reader(endpoint, credentials(site, "operator"))
+    stack.callback(new.session.close)
+    assert new.receives(daemon) == EXPECTED
+
+    # A lost key is revoked with its name: the reader gets another one, and the daemon is reloaded.
+    make_certificate(site, "operator-2", [], utc_now())
+    before = daemon._sessions
+    daemon.reload(access(site, "operator-2"))
+    wait_for(lambda: daemon._sessions not in (before, ()))
+    other = Reader(endpoint, credentials(site, "operator-2"))
+    stack.callback(other.session.close)
+    old.texts.clear()
+    assert other.receives(daemon) == EXPECTED
+    assert old.texts == []
 
 
-def test_the_budget_is_kept_and_the_newest_data_stay(tmp_path: Path, source: RecordedMachine) -> None:
-    folder, reports = folder_of(tmp_path, max_bytes=1e6), list(noise(240))
-    recorded(folder, source, reports)
-    files = sorted(file.path for file in folder.files())
-    assert sum(path.stat().st_size for path in files) <= 1.5e6  # the budget, and what was written since the last check
-    assert np.array_equal(omega(files[-1])[-200:], reports[-1].traces.measured[:, 1])
-    with RecordingReader(files[0], UNITS) as reader:
-        first = next(reader.chunks()).times[0]
-    assert first > BEGIN + 60.0
-
-
-def test_minutes_after_an_event_are_marked_too(tmp_path: Path, source: RecordedMachine) -> None:
-    """The event is in the third of the files of a minute; the mark ends five minutes later."""
-    folder, reports = folder_of(tmp_path), list(noise(330))
-    events = next(after.events for after in assessed(report(index, 5.8) for index in range(9)) if after.events)
-    assert events[0].change is EventChange.RAISED
-    reports[75] = Report(reports[75].document.model_copy(update={"events": events}), reports[75].traces)
-    recorded(folder, source, reports)
-    files = sorted(folder.files(), key=lambda file: file.begin)
-    begins = [file.begin - BEGIN for file in files if file.is_marked]
-    assert begins[-1] <= 75 * LENGTH + 300.0 < begins[-1] + 124.0
-    assert not files[-1].is_marked
-    assert len(omega(files[2].path)) == 30 * 200  # a file that was renamed while it was written
-
-
-def test_an_event_while_the_clock_was_ahead_marks_no_later_file(tmp_path: Path, source: RecordedMachine) -> None:
-    folder, reports = folder_of(tmp_path), list(noise(3))
-    events = next(after.events for after in assessed(report(index, 5.8) for index in range(9)) if after.events)
-    reports[0] = Report(reports[0].document.model_copy(update={"events": events}), reports[0].traces)
-    recording = RotatedRecording(folder.new_path(BEGIN), source, folder, BEGIN)
-    for one, now in zip(reports, (BEGIN + 1000 * DAY, BEGIN + 61.0, BEGIN + 1000.0), strict=True):
-        recording.add(one, now)
-    recording.close()
-    assert [file.is_marked for file in sorted(folder.files(), key=lambda file: file.begin)] == [
-        False,
-        False,
-        False,
-        True,
-    ]
-
-
-def test_the_group_may_read_files_whatever_the_mask_is(tmp_path: Path, source: RecordedMachine) -> None:
-    before = os.umask(0o077)
-    try:
-        folder = folder_of(tmp_path)
-        recorded(folder, source, list(noise(40)))
-    finally:
-        os.umask(before)
-    assert {file.path.stat().st_mode & 0o777 for file in folder.files()} == {0o640}
-
-
-def test_many_files_cost_neither_threads_nor_descriptors(tmp_path: Path, source: RecordedMachine) -> None:
-    """Rerun keeps two threads for each stream and for each default blueprint."""
-    folder, process = folder_of(tmp_path), psutil.Process()
-    recording = RotatedRecording(folder.new_path(BEGIN), source, folder, BEGIN)
-    counts = []
-    for hour, one in enumerate(noise(40)):
-        recording.add(one, BEGIN + 3600.0 * hour)
-        counts.append((process.num_threads(), process.num_fds()))
-    recording.close()
-    assert len(folder.files()) == 40
-    first, last = np.array(counts[5:10]), np.array(counts[-5:])  # what other tests left behind may end meanwhile
-    assert (last.max(axis=0) - first.max(axis=0)).max() <= 2
-
-
-def test_a_recording_without_a_folder_is_one_file(tmp_path: Path, source: RecordedMachine) -> None:
-    recording = RotatedRecording(tmp_path / "run.rrd", source, None, BEGIN)
-    for one in noise(40):
-        recording.add(one, one.document.window.end + 1e6)
-    recording.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["run.rrd"]
-
-
-def test_the_disk_is_checked_for_each_window(
-    tmp_path: Path, source: RecordedMachine, monkeypatch: pytest.MonkeyPatch
+def test_a_daemon_takes_over_a_renewed_certificate_without_a_restart(
+    site: Path, stack: ExitStack, caplog: pytest.LogCaptureFixture
 ) -> None:
-    folder = folder_of(tmp_path)
-    recording = RotatedRecording(folder.new_path(BEGIN), source, folder, BEGIN)
-    assert recording.has_room(BEGIN + 1.0)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 96 * 10**8, 4 * 10**8))
-    assert not recording.has_room(BEGIN + 2.0)
-    assert CHECK_INTERVAL > 2.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        recording.close()
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
+    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    connected = Reader(endpoint, credentials(site, "operator"))
+    stack.callback(connected.session.close)
+    assert connected.receives(daemon) == EXPECTED
+    assert "expires on" in daemon.warning(utc_now())
+    assert keys("renew", site, "press").exit_code == 0
+    wait_for(lambda: not daemon.warning(utc_now()))
+    later = Reader(endpoint, credentials(site, "operator"))
+    stack.callback(later.session.close)
+    assert later.receives(daemon) == EXPECTED
+    connected.texts.clear()
+    assert connected.receives(daemon) == EXPECTED  # it connects again by itself
+    assert "not taken over" not in caplog.text
+
+
+def test_half_of_a_renewal_changes_nothing(site: Path, stack: ExitStack, caplog: pytest.LogCaptureFixture) -> None:
+    """Certificate and key are copied one after the other."""
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
+    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    before = daemon._sessions
+    reader = Reader(endpoint, credentials(site, "operator"))
+    stack.callback(reader.session.close)
+    make_certificate(site, "new", ["localhost"], utc_now())
+    (site / "press.crt").write_bytes((site / "new.crt").read_bytes())
+    wait_for(lambda: "not taken over" in caplog.text)
+    assert caplog.text.count("press.key: does not belong to the certificate") == 1
+    assert daemon._sessions == before
+    assert reader.receives(daemon) == EXPECTED
+    (site / "press.key").write_bytes((site / "new.key").read_bytes())
+    wait_for(lambda: not daemon.warning(utc_now()))
+
+
+def test_renewing_keeps_hosts_and_the_old_files(site: Path) -> None:
+    old = (site / "press.crt").read_bytes(), (site / "press.key").read_bytes()
+    done = keys("renew", site, "press")
+    end = utc_now() + timedelta(days=20)
+    kept = site / f"press.until-{end:%Y-%m-%d}.crt"
+    assert (kept.read_bytes(), kept.with_suffix(".key").read_bytes()) == old
+    assert f"{kept}: the old certificate, stays valid until {end:%F}" in done.output
+    assert (site / "press.key").stat().st_mode & 0o777 == 0o600
+    hosts = {path.name: hosts for path, (_, hosts) in certificates.issued(site).items()}
+    assert hosts["press.crt"] == hosts[kept.name] == ("127.0.0.1", "localhost")
+    listed = keys("list", site).output.splitlines()
+    assert [line.split()[0] for line in listed] == ["ca", "operator", "press", kept.stem]
+    assert "days left" in listed[1]
+
+
+def test_a_second_renewal_on_a_day_loses_nothing(site: Path) -> None:
+    for _ in range(3):
+        assert keys("renew", site, "operator").exit_code == 0
+    assert len(list(site.glob("operator*.crt"))) == len(list(site.glob("operator*.key"))) == 4
+
+
+def test_a_name_without_certificate_cannot_be_renewed(site: Path) -> None:
+    with raises_saying(ConfigurationError, "visitor.crt"):
+        keys("renew", site, "visitor")
+    assert not list(site.glob("visitor*"))
+
+
+def test_a_name_that_has_a_certificate_is_told_how_to_renew_it(site: Path) -> None:
+    with raises_saying(ConfigurationError, "operator.key", "exists", f"'otolith keys renew {site} operator'"):
+        keys("add", site, "operator")
+
+
+def test_a_folder_that_takes_no_file_leaves_the_old_pair_in_place(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise ConfigurationError("no space left")
+
+    before = sorted(path.name for path in site.iterdir())
+    monkeypatch.setattr(certificates, "_write", full)
+    with raises_saying(ConfigurationError, "no space"):
+        keys("renew", site, "press")
+    assert sorted(path.name for path in site.iterdir()) == before

@@ -46,6 +46,18 @@ def test_limits_and_recording_change(tmp_path: Path) -> None:
     assert result.text.endswith("reloaded, recording changed")
 
 
+def test_readers_and_certificates_change_but_not_endpoints(tmp_path: Path) -> None:
+    access = '[zenoh.tls]\nca = "a"\ncertificate = "b"\nkey = "c"\n[zenoh.access]\nreaders = ["x"]\n[recording]'
+    result = change(tmp_path, "[recording]", access)
+    assert (result.access, result.needs_restart) == (True, ())
+    zenoh = result.machine.file.zenoh
+    assert zenoh.tls is not None
+    assert (zenoh.access.readers, zenoh.tls.certificate) == (("x",), Path("b"))
+    result = change(tmp_path, "[recording]", '[zenoh]\nconnect = ["tcp/127.0.0.1:7447"]\n[recording]')
+    assert (result.access, result.needs_restart) == (False, ("zenoh.connect",))
+    assert result.machine.file.zenoh.connect == ()
+
+
 @pytest.mark.parametrize(
     ("before", "after", "keys"),
     [

@@ -35,7 +35,8 @@ from otolith.cli.common import (
     shipped_directory,
 )
 from otolith.cli.operation.history import history, report, reproduce
-from otolith.cli.operation.install import install, keys
+from otolith.cli.operation.install import install
+from otolith.cli.operation.keys import keys
 from otolith.cli.operation.view import view
 from otolith.cli.terminal import echo
 
@@ -117,8 +118,8 @@ def cli() -> None:
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
     """Run the daemon for the machine in FILE.
 
-    It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits, rules and
-    [recording] from FILE.
+    It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits, rules,
+    [recording], certificates and readers from FILE.
 
     \b
     Examples:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 from otolith.health.limits import Level
-from otolith.health.observations import CLOCK
+from otolith.health.observations import CLOCK, DAEMON
 from otolith.health.schema import (
     EventChange,
     EventDocument,
@@ -133,8 +133,21 @@ def _bounded(spans: list[Span]) -> tuple[Span, ...]:
 def clock_event(time: float, by: float, window: int, language: Language) -> EventDocument:
     """Return the event that the clock was set ``by`` s, at a service time, before the window with this index."""
     text = texts_in(language)("clock_set", by=f"{by:+.0f}")
+    evidence = EvidenceDocument(windows=(window, window), value=by, unit="s")
+    return _noted(CLOCK, time, text, evidence, language)
+
+
+def expiry_event(time: float, certificate: str, end: str, window: int, language: Language) -> EventDocument:
+    """Return the event that a ``certificate`` of the daemon expires on the date ``end``, at a service time."""
+    text = texts_in(language)("certificate_expires", certificate=certificate, end=end)
+    event = _noted("certificate", time, text, EvidenceDocument(windows=(window, window)), language)
+    return event.model_copy(update={"part": DAEMON})
+
+
+def _noted(key: str, time: float, text: str, evidence: EvidenceDocument, language: Language) -> EventDocument:
+    """Return what happened at one moment."""
     return EventDocument(
-        id=f"{CLOCK}@{time:.1f}", part=CLOCK, state=Level.OK, change=EventChange.NOTED,
-        start=time, since=time, end=time, condition=text, condition_id=CLOCK, text=text, language=language,
-        evidence=EvidenceDocument(windows=(window, window), value=by, unit="s"),
+        id=f"{key}@{time:.1f}", part=key, state=Level.OK, change=EventChange.NOTED,
+        start=time, since=time, end=time, condition=text, condition_id=key, text=text, language=language,
+        evidence=evidence,
     )  # fmt: skip

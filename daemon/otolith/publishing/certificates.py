@@ -22,6 +22,8 @@ from otolith_drivers.errors import ConfigurationError, NotValidNowError
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' makes
 CLOCK_TOLERANCE = timedelta(hours=1)  # by which a new certificate is valid before it was made
 
+KINDS = ("crt", "key")  # suffixes of the files of a certificate
+
 Key = tuple[str, ...]  # Key of the machine file, or option, that names a file
 
 
@@ -32,6 +34,15 @@ class Identity:
     ca: Path
     certificate: Path
     key: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Renewal:
+    """What became of the certificate of a name when another was made for it."""
+
+    kept: Path  # Where the old certificate is now; its key is beside it
+    old_end: datetime
+    end: datetime  # Of the new certificate
 
 
 def authorities(path: Path, key: Key) -> list[x509.Certificate]:
@@ -73,7 +84,7 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
         raise NotValidNowError(f"{name}: valid only from {start}; check the clock of this computer", at_certificate)
     if now > own.not_valid_after_utc:
         expired = f"expired on {own.not_valid_after_utc:%Y-%m-%d}"
-        raise NotValidNowError(f"{name}: {expired}; 'otolith keys add' makes another", at_certificate)
+        raise NotValidNowError(f"{name}: {expired}; 'otolith keys renew' makes another", at_certificate)
     return own.not_valid_after_utc
 
 
@@ -145,6 +156,50 @@ def make_certificate(folder: Path, name: str, hosts: Sequence[str], now: datetim
     Raises:
         ConfigurationError: the folder has no authority, or the files exist.
     """
+    private, certificate = _issue(folder, name, hosts, now)
+    _write(folder / name, private, certificate, f"'otolith keys renew {folder} {name}' makes another for this name")
+    return certificate.not_valid_after_utc
+
+
+def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: datetime) -> Renewal:
+    """Write a new certificate and key for ``name``, for ``hosts`` or for those of the old one, which is kept.
+
+    Raises:
+        ConfigurationError: there is no certificate or authority, or the folder cannot be written.
+    """
+    (old,) = authorities(folder / f"{name}.crt", ())[:1]
+    end = old.not_valid_after_utc
+    private, certificate = _issue(folder, name, hosts or sorted(_names(old)), now)
+    stem, number = folder / f"{name}.until-{end:%Y-%m-%d}", 1
+    while any(stem.with_name(f"{stem.name}.{kind}").exists() for kind in KINDS):
+        stem, number = folder / f"{name}.until-{end:%Y-%m-%d}-{number + 1}", number + 1
+    moved = [(folder / f"{name}.{kind}", stem.with_name(f"{stem.name}.{kind}")) for kind in KINDS]
+    moved = [(path, kept) for path, kept in moved if path.exists()]
+    try:
+        for path, kept in moved:
+            path.rename(kept)
+        _write(folder / name, private, certificate)
+    except (OSError, ConfigurationError) as error:
+        for path, kept in moved:
+            if kept.exists():
+                kept.rename(path)
+        if isinstance(error, ConfigurationError):
+            raise
+        raise ConfigurationError(f"{folder}: cannot be written: {error.strerror}") from error
+    return Renewal(stem.with_name(f"{stem.name}.crt"), end, certificate.not_valid_after_utc)
+
+
+def issued(folder: Path) -> dict[Path, tuple[datetime, tuple[str, ...]]]:
+    """Return the end and the hosts of each certificate in ``folder``, by its path; the authority is the first."""
+    paths = sorted(folder.glob("*.crt"), key=lambda path: (path.stem != "ca", path.name))
+    first = {path: authorities(path, ())[0] for path in paths}
+    return {path: (own.not_valid_after_utc, tuple(sorted(_names(own)))) for path, own in first.items()}
+
+
+def _issue(
+    folder: Path, name: str, hosts: Sequence[str], now: datetime
+) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+    """Return a new key for ``name``, and its certificate of the authority in ``folder``."""
     if name == "ca":
         raise ConfigurationError(f"{folder / name}.crt: is the certificate of the authority: use another name")
     (authority,) = authorities(folder / "ca.crt", ())[:1]
@@ -164,9 +219,7 @@ def make_certificate(folder: Path, name: str, hosts: Sequence[str], now: datetim
     builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
         builder = builder.add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
-    certificate = builder.sign(signer, hashes.SHA256())
-    _write(folder / name, private, certificate)
-    return certificate.not_valid_after_utc
+    return private, builder.sign(signer, hashes.SHA256())
 
 
 def _builder(
@@ -191,14 +244,19 @@ def _host(text: str) -> x509.GeneralName:
     return x509.DNSName(text) if address is None else x509.IPAddress(address)
 
 
-def _write(stem: Path, private: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+def _write(
+    stem: Path,
+    private: ec.EllipticCurvePrivateKey,
+    certificate: x509.Certificate,
+    remedy: str = "use another name or folder",
+) -> None:
     """Write key and certificate as new files; neither replaces another."""
     pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     own = private.private_bytes(pem, pkcs8, serialization.NoEncryption())
     paths = (stem.with_name(f"{stem.name}.key"), stem.with_name(f"{stem.name}.crt"))
     for path in paths:
         if path.exists():
-            raise ConfigurationError(f"{path}: exists and is not replaced; use another name or folder")
+            raise ConfigurationError(f"{path}: exists and is not replaced; {remedy}")
     for path, data, mode in ((paths[0], own, 0o600), (paths[1], certificate.public_bytes(pem), 0o644)):
         try:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

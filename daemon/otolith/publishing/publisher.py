@@ -1,13 +1,12 @@
 """Publishes the reports of one machine on all its endpoints; one that cannot be opened does not concern the others.
 
 All endpoints share one Zenoh session. If one of them cannot be opened, each gets a session of its own, and a thread
-tries the rest again.
+tries the rest again. It also looks whether certificates or passwords were replaced: then it opens the sessions anew.
 """
 
 import logging
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 
@@ -15,7 +14,7 @@ import zenoh
 
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
-from otolith.publishing.zenoh_config import ENCRYPTED, Access, Validity, listening
+from otolith.publishing.zenoh_config import ENCRYPTED, Access, Settings, Validity, listening
 from otolith.publishing.zenoh_session import ALIVE, EVENT, PARAMETER, REPORT, answer, close_session, prefix, session
 from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.config_files import DocumentModel
@@ -25,6 +24,8 @@ log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 FIRST_RETRY, MAX_RETRY = 1.0, 30.0  # s from an endpoint that could not be opened to the next try; it doubles
+RENEWAL_INTERVAL = 60.0  # s between two looks at the files of certificates and passwords
+NOTICE_DAYS = (30, 7)  # days before a certificate expires at which that is an event
 CLOSE_WAIT = 1.0  # s for a try that has begun
 UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; everything else is a mistake
 
@@ -56,6 +57,8 @@ class _Session:
     opened: zenoh.Session
     reports: zenoh.Publisher
     declared: tuple[object, ...]
+    access: Access
+    stamps: tuple[object, ...]  # Of the files of ``access`` when it was opened
 
 
 class Publisher:
@@ -75,20 +78,21 @@ class Publisher:
             ConfigurationError: the machine file, or a file that it names, is wrong.
         """
         self._site, self._machine, self._access, self._archive = site, machine, access, archive
-        self._lock, self._closing = threading.Lock(), threading.Event()
+        self._lock, self._closing, self._wake = threading.Lock(), threading.Event(), threading.Event()
         self._latest: str | None = None
         self._validity, self._warned_on = Validity(), date.min
+        self._noticed: tuple[datetime | None, int] = (None, 0)  # End of validity, and days, of the last notice
+        self._refused = ""  # Why files that were replaced cannot be used
         self._sessions: tuple[_Session, ...] = ()
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
-        self._thread = threading.Thread(target=self._retry, name="open-endpoints", daemon=True)
+        self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
         everything = _Endpoints(tuple(listen), tuple(access.zenoh.connect))
         try:
             self._open(everything)
         except UNAVAILABLE as error:
             self._open_each(everything, error)
         self.warn_of_expiry(datetime.now(UTC))
-        if self._waiting:
-            self._thread.start()
+        self._thread.start()
 
     @property
     def endpoints(self) -> str:
@@ -99,22 +103,27 @@ class Publisher:
     def publish(self, document: ReportDocument) -> None:
         """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
         text = document.to_json()
-        with self._lock:
-            self._latest, sessions = text, self._sessions
         others: list[tuple[str, DocumentModel]] = [
             (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
         ]
         others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
         texts = [(key, item.json_line()) for key, item in others]
-        for each in sessions:
-            each.reports.put(text)
-            for key, own in texts:
-                each.opened.put(
-                    key,
-                    own,
-                    encoding=zenoh.Encoding.APPLICATION_JSON,
-                    congestion_control=zenoh.CongestionControl.DROP,
-                )
+        with self._lock:  # so that no session is closed meanwhile
+            self._latest = text
+            for each in self._sessions:
+                each.reports.put(text)
+                for key, own in texts:
+                    each.opened.put(
+                        key,
+                        own,
+                        encoding=zenoh.Encoding.APPLICATION_JSON,
+                        congestion_control=zenoh.CongestionControl.DROP,
+                    )
+
+    def reload(self, access: Access) -> None:
+        """Let a thread take over certificates, passwords and readers of a changed machine file."""
+        self._access = access
+        self._wake.set()
 
     def outages(self, now: datetime) -> dict[str, str]:
         """Return the endpoints where nobody can connect, and why."""
@@ -130,11 +139,27 @@ class Publisher:
             self._warned_on = now.date()
             log.warning("%s", warning)
 
+    def warning(self, now: datetime) -> str:
+        """Return that the certificate expires soon or has expired; else an empty text."""
+        return self._validity.warning(now)
+
+    def expiry_notice(self, now: datetime) -> Validity | None:
+        """Return the validity of the certificate once on each of ``NOTICE_DAYS`` before it ends."""
+        validity = self._validity
+        if validity.end is None or now > validity.end:
+            return None
+        left = (validity.end - now).total_seconds() / 86_400.0
+        days = min((days for days in NOTICE_DAYS if left <= days), default=0)
+        if not days or self._noticed == (validity.end, days):
+            return None
+        self._noticed = validity.end, days
+        return validity
+
     def close(self) -> None:
         """Close the sessions; subscribers see the liveliness token disappear."""
         self._closing.set()
-        with suppress(RuntimeError):  # it was never started
-            self._thread.join(CLOSE_WAIT)
+        self._wake.set()
+        self._thread.join(CLOSE_WAIT)
         with self._lock:
             sessions, self._sessions = self._sessions, ()
         for each in sessions:
@@ -150,33 +175,68 @@ class Publisher:
                     continue
                 except UNAVAILABLE as own:
                     error = own
-            self._waiting[endpoints] = str(error)
+            with self._lock:
+                self._waiting = {**self._waiting, endpoints: str(error)}
             log.warning("no reports on %s: %s; it is tried again", endpoints.text, error)
 
-    def _retry(self) -> None:
+    def _keep_open(self) -> None:
         pause = FIRST_RETRY
-        while self._waiting and not self._closing.wait(pause):
-            pause = min(2.0 * pause, MAX_RETRY)
-            for endpoints, before in list(self._waiting.items()):
-                reason = ""
-                try:
-                    self._open(endpoints)
-                except Exception as error:  # noqa: BLE001 - OtolithError, OSError of a disk, or a bug: none ends it
-                    reason = str(error) or type(error).__name__
-                if not reason:
-                    log.info("reports on %s as well", endpoints.text)
-                elif reason != before:
-                    log.warning("no reports on %s: %s; it is tried again", endpoints.text, reason)
-                waiting = {**self._waiting, endpoints: reason}
-                with self._lock:
-                    self._waiting = {each: text for each, text in waiting.items() if text}
+        while True:
+            self._wake.wait(pause if self._waiting else RENEWAL_INTERVAL)
+            self._wake.clear()
+            if self._closing.is_set():
+                return
+            pause = min(2.0 * pause, MAX_RETRY) if self._waiting else FIRST_RETRY
+            self._retry()
+            self._renew()
+
+    def _renew(self) -> None:
+        """Open each session anew whose files were replaced, or whose access was changed, if they can be used now."""
+        with self._lock:
+            sessions, access = self._sessions, self._access
+        for each in sessions:
+            if each.access == access and each.stamps == access.stamps():
+                continue
+            try:
+                self._settings(access, each.endpoints)
+            except (OtolithError, OSError) as error:  # one of two files may not be written yet
+                if str(error) != self._refused:
+                    self._refused = str(error)
+                    log.warning("%s: not taken over: %s", each.endpoints.text, error)
+                continue
+            self._refused = ""
+            with self._lock:
+                self._sessions = tuple(other for other in self._sessions if other is not each)
+            close_session(each.opened)
+            try:
+                self._open(each.endpoints)
+            except UNAVAILABLE as error:
+                self._open_each(each.endpoints, error)
+            end = "" if self._validity.end is None else f", which are valid until {self._validity.end:%Y-%m-%d}"
+            log.info("reports on %s: certificates, passwords and readers are taken over%s", each.endpoints.text, end)
+
+    def _retry(self) -> None:
+        for endpoints, before in list(self._waiting.items()):
+            reason = ""
+            try:
+                self._open(endpoints)
+            except Exception as error:  # noqa: BLE001 - OtolithError, OSError of a disk, or a bug: none ends it
+                reason = str(error) or type(error).__name__
+            if not reason:
+                log.info("reports on %s as well", endpoints.text)
+            elif reason != before:
+                log.warning("no reports on %s: %s; it is tried again", endpoints.text, reason)
+            waiting = {**self._waiting, endpoints: reason}
+            with self._lock:
+                self._waiting = {each: text for each, text in waiting.items() if text}
 
     def _open(self, endpoints: _Endpoints) -> None:
         """Open a session; raise what is in ``UNAVAILABLE``, or ConfigurationError."""
         site, machine = self._site, self._machine
         listen = listening(endpoints.listen, f"{site}.{machine}")
-        zenoh_table = self._access.zenoh.model_copy(update={"connect": endpoints.connect})
-        settings, validity = replace(self._access, zenoh=zenoh_table).settings(prefix(site, machine), listen)
+        access = self._access
+        stamps = access.stamps()  # before the files are read: a later change shows
+        settings, validity = self._settings(access, _Endpoints(listen, endpoints.connect))
         opened = session(listen, endpoints.connect, settings)
         key = REPORT.under(site, machine)
         reports = opened.declare_publisher(
@@ -190,12 +250,17 @@ class Publisher:
         with self._lock:
             is_late = self._closing.is_set()
             if not is_late:
-                self._sessions += (_Session(_Endpoints(listen, endpoints.connect), opened, reports, declared),)
+                own = _Session(_Endpoints(listen, endpoints.connect), opened, reports, declared, access, stamps)
+                self._sessions += (own,)
         if is_late:
             close_session(opened)
             return
         if any(endpoint.startswith(ENCRYPTED) for endpoint in (*listen, *endpoints.connect)):
             self._validity = validity
+
+    def _settings(self, access: Access, endpoints: _Endpoints) -> tuple[Settings, Validity]:
+        own = access.zenoh.model_copy(update={"connect": endpoints.connect})
+        return replace(access, zenoh=own).settings(prefix(self._site, self._machine), endpoints.listen)
 
     def _answer(self, query: zenoh.Query) -> None:
         with self._lock:

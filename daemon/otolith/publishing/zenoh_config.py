@@ -62,7 +62,9 @@ class Validity:
         if self.end is None or self.end - now >= EXPIRY_WARNING:
             return ""
         time = f"{'expired' if now > self.end else 'expires'} on {self.end:%Y-%m-%d}"
-        return f"{self.certificate}: {time}; then nobody can connect: replace it and its key, and restart the daemon"
+        return (
+            f"{self.certificate}: {time}; then nobody can connect: replace it and its key, which the daemon takes over"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,12 @@ class Access:
 
     zenoh: ZenohTable = field(default_factory=ZenohTable)
     path: Path = Path()
+
+    def stamps(self) -> tuple[object, ...]:
+        """Return what differs once one of the files of certificates or passwords is replaced."""
+        table, folder = self.zenoh, self.path.parent.absolute()
+        names = () if table.tls is None else (table.tls.ca, table.tls.certificate, table.tls.key)
+        return tuple(_stamp(folder / name) for name in (*names, table.access.passwords) if name is not None)
 
     def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, Validity]:
         """Return settings to publish below ``prefix``, and their validity.
@@ -154,6 +162,14 @@ class Access:
         policies = [{"rules": [rule["id"] for rule in rules], "subjects": [subject["id"] for subject in subjects]}]
         control: Settings = {"enabled": True, "default_permission": "deny"}
         return {**control, "rules": rules, "subjects": subjects, "policies": policies}
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:  # while it is being replaced
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 _VERIFIED: Settings = {"verify_name_on_connect": True, "close_link_on_expiration": True}

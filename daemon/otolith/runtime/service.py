@@ -35,7 +35,7 @@ from otolith.adaptation.state import (
     with_sample_grid,
 )
 from otolith.health.diagnosis import MonitoringPlan
-from otolith.health.labels import clock_event
+from otolith.health.labels import clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
@@ -76,17 +76,18 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """What a changed machine file changes in a running daemon: limits, rules, recording. The rest needs a restart."""
+    """What a changed machine file changes in a running daemon; what is not named here needs a restart."""
 
     machine: LoadedMachine  # The machine to go on with
     limits: bool  # Or rules of the diagnosis
     recording: bool
+    access: bool  # Certificates, passwords and readers
     needs_restart: tuple[str, ...]  # Keys of the file that were changed and that a running daemon does not take over
 
     @property
     def text(self) -> str:
         """What has changed, in words."""
-        names = {"limits or rules": self.limits, "recording": self.recording}
+        names = {"limits or rules": self.limits, "recording": self.recording, "access": self.access}
         changed = " and ".join(name for name, is_changed in names.items() if is_changed) or "nothing"
         line = f"{self.machine.path}: reloaded, {changed} changed"
         return f"{line}; only a restart takes over {', '.join(self.needs_restart)}" if self.needs_restart else line
@@ -101,21 +102,28 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     old, file = running.file, new.file
     changed = list(_differences(old.model_dump(), file.model_dump()))
     recording = any(key[0] == "recording" for key in changed)
+    access = any(_is_access(key) for key in changed)
     limits = [key for key in changed if _is_limit(key)]
-    rest = [key for key in changed if key[0] != "recording" and not _is_limit(key)]
+    rest = [key for key in changed if key[0] != "recording" and not (_is_limit(key) or _is_access(key))]
     if new.twin != running.twin and not any(key[0] == "twin" for key in rest):
         rest.append(("twin", "file"))
-    update: dict[str, Any] = {"recording": file.recording}
+    own = file.zenoh.access.model_copy(update={"networks": old.zenoh.access.networks})
+    tables = {"tls": file.zenoh.tls, "access": own}
+    update: dict[str, Any] = {"recording": file.recording, "zenoh": old.zenoh.model_copy(update=tables)}
     if any(key[0] in {"twin", "parameters"} or key == ("machine", "language") for key in rest):
         rest, limits = [*rest, *limits], []
     if limits:
         update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
     machine = replace(running, file=old.model_copy(update=update), plan=new.plan if limits else running.plan)
-    return Reload(machine, bool(limits), recording, tuple(".".join(key) for key in rest))
+    return Reload(machine, bool(limits), recording, access, tuple(".".join(key) for key in rest))
 
 
 def _is_limit(key: Key) -> bool:
     return key[0] in {"components", "rule"} or (key[0] == "parameters" and key[-1] in {"watch", "act"})
+
+
+def _is_access(key: Key) -> bool:
+    return key[:2] == ("zenoh", "tls") or key in {("zenoh", "access", "readers"), ("zenoh", "access", "passwords")}
 
 
 def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
@@ -182,7 +190,7 @@ class Service:
         self._history = history_of(file)
         self._evidence = EvidenceWriter(machine)
         self._read_clocks, self._clock = clocks, ServiceClock(read=clocks)
-        self._clock_events: tuple[EventDocument, ...] = ()  # that the next report has
+        self._noted: tuple[EventDocument, ...] = ()  # events that the next report has
         self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
@@ -321,7 +329,7 @@ class Service:
             self._history.start()
 
     def _reload(self) -> None:
-        """Take over limits, rules and recording from the machine file; if it is invalid, go on as before."""
+        """Take over limits, rules, recording and access from the machine file; if it is invalid, go on as before."""
         self._is_reload_due = False
         try:
             change = reloaded(self._machine, load_machine(self._machine.path))
@@ -335,6 +343,8 @@ class Service:
         if change.limits:
             # The decisions contain the baselines to which limits in percent refer.
             self._supervisor.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
+        if self._publisher is not None:  # also if the files have the same names as before
+            self._publisher.reload(Access(self._machine.file.zenoh, self._machine.path))
         if change.recording:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
@@ -387,7 +397,7 @@ class Service:
         if by is not None:
             self._saved_at = -math.inf
             event = clock_event(self._clock.now(), by, self._windows, self._machine.file.machine.language)
-            self._clock_events = (*self._clock_events, event)
+            self._noted = (*self._noted, event)
 
     def _adopt_achieved_period(self, period: float | None) -> None:
         """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
@@ -402,15 +412,16 @@ class Service:
         log.warning("%s: windows now have %s", change, size)
 
     def _publish(self, report: Report, seconds: float) -> None:
-        document, noted = report.document, self._clock_events
-        self._clock_events = ()
+        document, noted = report.document, self._noted
+        self._noted, warning = (), "" if self._publisher is None else self._publisher.warning(datetime.now(UTC))
         latency = max(0.0, self._clock.now() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         driver = driver_document(self._machine.driver.link())
         parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         update["events"] = (*noted, *document.events)
-        document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
+        update["notes"] = (*self._notes, *filter(None, [warning]))
+        document = self._numbers.number(document.model_copy(update=update))
         if self._history is not None:
             self._describe()
             self._history.labels = self._clock.labels
@@ -457,9 +468,16 @@ class Service:
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
         if is_due and self._publisher is not None:
-            self._publisher.warn_of_expiry(datetime.now(UTC))
+            self._warn_of_expiry(self._publisher, datetime.now(UTC))
         self._notifier.send(f"STATUS={line}")
         log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line)
+
+    def _warn_of_expiry(self, publisher: Publisher, now: datetime) -> None:
+        """Log that the certificate of an endpoint expires soon, and note it in the next report."""
+        publisher.warn_of_expiry(now)
+        if (notice := publisher.expiry_notice(now)) is not None:
+            names, language = (str(notice.certificate), f"{notice.end:%Y-%m-%d}"), self._machine.file.machine.language
+            self._noted = (*self._noted, expiry_event(self._clock.now(), *names, self._windows, language))
 
     def _save(self, now: float) -> None:
         """Request a save if components or open events have changed, or the last save is ``SAVE_INTERVAL`` ago.
