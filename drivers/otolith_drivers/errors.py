@@ -9,15 +9,22 @@ Each message names the file or device, the key or signal, the value, the bound o
 raised where the fault is detected; only ``otolith.__main__`` prints it, as one line, and turns it into an exit code.
 """
 
+import shlex
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 
 MAX_NAMES = 12  # names of messages, arbitration IDs or signals in a line
 
 
 def installation_of(extra: str) -> str:
-    """The command that installs an extra into the environment of this Otolith, whichever ``pip`` a shell would take."""
-    return f"{sys.executable} -m pip install 'otolith[{extra}]'"
+    """The command that installs the libraries of an extra into the environment of this Otolith.
+
+    It names them and not Otolith, which may come from a clone, or from wheels that are gone.
+    """
+    rows = (row.partition(";") for row in metadata.requires("otolith") or ())
+    own = (library.strip() for library, _, marker in rows if f'extra == "{extra}"' in marker.replace("'", '"'))
+    return f"{sys.executable} -m pip install {shlex.join(own)}"
 
 
 class OtolithError(Exception):

@@ -114,3 +114,14 @@ def test_every_link_of_a_page_leads_to_a_file(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")]
     assert [link for link in links if not (ROOT / page).parent.joinpath(link).exists()] == []
+
+
+def test_no_text_tells_to_install_otolith_from_an_index() -> None:
+    """It is in none."""
+    sources = [path for folder in ("drivers", "daemon") for path in (ROOT / folder).rglob("*.py")]
+    wrong = re.compile(r"pip install[^\n]* '?otolith(?:\[|'|$)")
+    texts = {
+        path: path.read_text(encoding="utf-8").splitlines() for path in (*(ROOT / page for page in PAGES), *sources)
+    }
+    found = [path for path, lines in texts.items() for line in lines if wrong.search(line) and "--no-index" not in line]
+    assert found == []

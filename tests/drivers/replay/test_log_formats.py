@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, installation_of
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import mf4
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
@@ -319,7 +319,7 @@ def test_of_a_damaged_mf4_file_the_library_prints_nothing(tmp_path: Path, frames
 def test_a_missing_library_for_mf4_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bus.mf4").write_bytes(b"MDF     4.10")
     monkeypatch.setattr(mf4, "find_spec", lambda _: None)
-    with pytest.raises(ConfigurationError, match=re.escape("pip install 'otolith[mf4]'")):
+    with pytest.raises(ConfigurationError, match=re.escape(installation_of("mf4"))):
         read(tmp_path / "bus.mf4")
 
 
