@@ -27,7 +27,7 @@ MOTOR, ALL = find_twin("dc_motor"), ("R_a", "L_a", "J", "D")
 DEVIATIONS = 4.0  # standard deviations: several hundred values are compared
 ROWS, SLOW_OMEGA = Schedule(rows=Timing(0.01)), Schedule(omega=Timing(0.05))
 FINDING = re.compile(
-    r'(\w+) is ([\d.]+) ms late \(([\d.]+) to ([\d.]+)\): write delay = "([\d.]+) ms" under \[signals\]'
+    r'(\w+) is ([\d.]+) ms late \(([\d.]+) to ([\d.]+)\); write delay = "([\d.]+) ms" under \[signals\]'
 )
 
 
@@ -45,7 +45,7 @@ def reports(folder: Path, recording: Recording, schedule: Schedule = ROWS, extra
 
 def assert_named(document: ReportDocument, name: str, delay: float, within: float = 1.0) -> None:
     """The first finding names signal, delay (ms), ``within`` as many ms, and interval."""
-    finding = FINDING.search(document.findings[0].text)
+    finding = FINDING.search("; ".join((document.findings[0].text, document.findings[0].setting)))
     assert finding is not None, document.findings
     value, low, high = map(float, finding.group(2, 3, 4))
     assert finding.group(1) == name

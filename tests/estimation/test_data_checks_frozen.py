@@ -70,7 +70,7 @@ def frozen_from(window: Window, signal: str, first: int, last: int = RECORDS) ->
 def faults(problem: Problem, window: Window, state: AdaptationState | None = None) -> tuple[str, ...]:
     posterior = Posterior.initial(problem) if state is None else state.posterior
     return tuple(
-        f"{sensor.text}; {sensor.advice}" for sensor in check_window(window, posterior.predict(window)).faulty_sensors
+        f"{sensor.text}; {sensor.setting}" for sensor in check_window(window, posterior.predict(window)).faulty_sensors
     )
 
 

@@ -86,7 +86,7 @@ def test_share_of_spikes_is_that_of_the_samples() -> None:
     (sensor,) = drop_spikes(replace(window, values=values, missing=missing), TWIN, NOISE)[2]
     assert sensor.signal == "i"
     assert "i spikes in 5 of 40 records" in sensor.text
-    assert 'checks = ["frozen", "stale"]' in sensor.advice
+    assert 'checks = ["frozen", "stale"]' in sensor.setting
 
 
 def test_measured_input_is_bridged_from_the_samples_beside_a_spike() -> None:

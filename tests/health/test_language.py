@@ -107,8 +107,8 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
             "ein Sprung von V_a von 3 auf 5 V würde entscheiden, wenn die anderen Eingangsgrößen bleiben, wie sie sind",
         ),
         (
-            "a signal is late: i is 5 ms late (4 to 6): write delay = 5 under [signals] i (9%)",
-            "ein Signal kommt verspätet: i kommt 5 ms zu spät (4 bis 6): delay = 5 eintragen unter [signals] i (9 %)",
+            "a signal is late: i is 5 ms late (4 to 6) (9%); write delay = 5 under [signals] i",
+            "ein Signal kommt verspätet: i kommt 5 ms zu spät (4 bis 6) (9 %); delay = 5 eintragen unter [signals] i",
         ),
         ("5% of i is missing, more than missing_limit (1%)", "5% von i fehlen, mehr als missing_limit (1%)"),
         ("shaft: -0.004·sin(angle(omega)) N*m", "shaft: -0.004·sin(angle(omega)) N*m"),

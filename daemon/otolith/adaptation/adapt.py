@@ -33,7 +33,7 @@ from otolith.discovery.decision import (
     keep_present,
     with_approvals,
 )
-from otolith.discovery.hypotheses import CHANGING, FaultType
+from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.noise_hypothesis import likelier_levels_of, prior_inflation
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
@@ -68,8 +68,7 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     bridged = with_changes_between(window, commands) if commands else window
     state, predicted, checked = _predict_and_check(state, bridged)
     result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
-    named = map(CHANGING.format, commands)
-    result = replace(result, notes=(*checked.notes, *named, *(own.text for own in result.faulty_sensors)))
+    result = replace(result, notes=(*checked.notes, *(own.text for own in result.faulty_sensors)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
@@ -131,7 +130,7 @@ def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWind
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
     """Return the result of a window whose data are faulty: it does not update the posterior."""
     decision = WindowDecision.BAD if checked.bad else WindowDecision.SENSOR
-    reason = UNUSED + "; ".join(checked.bad or (f"{sensor.text}; {sensor.advice}" for sensor in checked.faulty_sensors))
+    reason = UNUSED + "; ".join(checked.bad or (sensor.text for sensor in checked.faulty_sensors))
     result = WindowResult.unchanged(state, predicted, decision, reason=reason)
     return replace(result, faulty_sensors=checked.faulty_sensors)
 

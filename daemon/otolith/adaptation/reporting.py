@@ -23,7 +23,15 @@ from otolith.discovery.decision import (
     alternatives_of,
 )
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_levels
+from otolith.discovery.hypotheses import (
+    CHANGING,
+    POLLED,
+    FaultType,
+    describe_hypothesis,
+    describe_levels,
+    describe_setting,
+    is_noisier_than_stated,
+)
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
@@ -74,9 +82,7 @@ NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may 
 NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the noise is not as large as [noise] or [process_noise] says"
-NOISE_ADVICE = (
-    "if it was always so, correct [noise] or [process_noise]; otherwise inspect the sensor, its cable and its supply"
-)
+NOISE_SETTING = "if the machine is well, write what was found into [noise] or [process_noise]"
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
 
@@ -167,7 +173,15 @@ def make_report(
         explanations=_explanations(undecided),
         findings=(
             *(_sensor_finding(sensor, window.start) for sensor in result.faulty_sensors),
-            *_findings(components, undecided, result, result.noisier_since(state), _experiment(undecided, situation)),
+            *(_polled_finding(command, window.start) for command in problem.changing),
+            *_findings(
+                components,
+                undecided,
+                result,
+                result.noisier_since(state),
+                _experiment(undecided, situation),
+                window.start,
+            ),
         ),
         **_fit_and_cost(problem, result),
     )
@@ -371,6 +385,7 @@ def _sensor_finding(sensor: FaultySensor, start: float) -> FindingDocument:
         text=sensor.text,
         since=start,
         advice=sensor.advice,
+        setting=sensor.setting,
     )
 
 
@@ -405,7 +420,22 @@ def _noise_finding(problem: Problem, since: float) -> FindingDocument:
         condition=NOISE_CONDITION,
         text="; ".join(describe_levels(problem)),
         since=since,
-        advice=NOISE_ADVICE,
+        setting=NOISE_SETTING,
+        of_file=not is_noisier_than_stated(problem),
+    )
+
+
+def _polled_finding(command: str, since: float) -> FindingDocument:
+    return FindingDocument(
+        id=f"{FindingKind.POLLED}/{command}",
+        kind=FindingKind.POLLED,
+        subject=command,
+        severity=Severity.WARNING,
+        condition=CHANGING.format(command),
+        text=CHANGING.format(command),
+        since=since,
+        setting=POLLED.format(command),
+        of_file=True,
     )
 
 
@@ -413,6 +443,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
     """Return the finding of a test that is still open after ``decision``."""
     kind, subject = _kind_and_subject(decision, test)
     text = _hypotheses_text(test)
+    leading = next((item for item in test.hypotheses if item.type is FaultType.TIMING), test.best)
     condition = AMBIGUOUS_CONDITION if test.explains_window else NOT_EXPLAINED
     return FindingDocument(
         id=f"{kind}/{subject}" if subject else "undecided",
@@ -422,7 +453,8 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         condition=_what_is_new(test) if kind is FindingKind.OPEN else condition,
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
-        advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
+        advice=experiment,
+        setting=describe_setting(leading) if kind is FindingKind.TIMING else _corrected_value(test),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
     )
 
@@ -489,8 +521,8 @@ def _component_finding(component: ComponentDocument) -> FindingDocument:
     )
 
 
-def _machine_file_advice(test: SequentialTest) -> str:
-    """Return what to do where a parameter seems to have moved that the machine file gives as known."""
+def _corrected_value(test: SequentialTest) -> str:
+    """Return what to write where a parameter seems to have moved that the machine file gives as known."""
     null = [item.problem.known for item in test.hypotheses if item.type is FaultType.NOTHING]
     known = {name for pairs in null for name, _ in pairs}
     if test.best.type is not FaultType.PARAMETER:

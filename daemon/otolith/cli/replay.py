@@ -78,7 +78,7 @@ class ReplaySummary:
         for component in last.components:
             yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
         for event in self._events.values():
-            yield Text(event_text(event), style=event_style(event))
+            yield Text(event_text(event, details=True), style=event_style(event))
         candidates = (finding for finding in last.findings if finding.kind is FindingKind.OPEN)
         yield from (Text(finding_text(finding), style="magenta") for finding in candidates)
         yield from self._counts()

@@ -29,7 +29,7 @@ MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
 MS = 1e3  # ms in a second
-CHANGING = '{0} changes between its samples: write times = "polled" under [signals] {0}'
+CHANGING, POLLED = "{} changes between its samples", 'write times = "polled" under [signals] {}'
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
 
@@ -450,6 +450,11 @@ def describe_noise(problem: Problem) -> str:
     return "; ".join([*describe_levels(problem), *map(CHANGING.format, problem.changing)])
 
 
+def is_noisier_than_stated(problem: Problem) -> bool:
+    """Whether the noise of something is larger than the machine file states; stating none is no statement."""
+    return any(noise > stated > 0.0 for noise, stated in zip(problem.levels, problem.stated_levels, strict=True))
+
+
 def describe_levels(problem: Problem) -> list[str]:
     """Return a text for each input, output and state whose noise is not as stated, with both levels."""
     twin = problem.base_model
@@ -468,10 +473,23 @@ def describe_levels(problem: Problem) -> list[str]:
 
 def _describe_delay(tracked: TrackedHypothesis) -> str:
     ((signal, delay),) = tracked.problem.delays
+    value, low, high = _delay_numbers(tracked)
+    return f"{signal} is {value} {'ms late' if delay > 0.0 else 'ms early'} ({low} to {high})"
+
+
+def _delay_numbers(tracked: TrackedHypothesis) -> tuple[str, str, str]:
+    """Return the size of a delay and the ends of its 95 % interval, ms."""
+    ((_, delay),) = tracked.problem.delays
     reach = QUANTILE / np.sqrt(tracked.delay_information) if tracked.delay_information > 0.0 else np.inf
-    digits = max(0, int(np.ceil(-np.log10(MS * reach)))) if 0.0 < reach < np.inf else 1
-    size = abs(delay)
+    digits, size = max(0, int(np.ceil(-np.log10(MS * reach)))) if 0.0 < reach < np.inf else 1, abs(delay)
     value, low, high = (f"{MS * number:.{digits}f}" for number in (size, size - reach, size + reach))
-    late = f"{signal} is {value} ms {'late' if delay > 0.0 else 'early'} ({low} to {high})"
+    return value, low, high
+
+
+def describe_setting(tracked: TrackedHypothesis) -> str:
+    """Return the delay of a late or early signal, as it is written into the machine file; empty without one."""
+    if not tracked.problem.delays:
+        return ""
+    ((signal, delay),) = tracked.problem.delays
     place = f"[signals] {signal}" if delay > 0.0 else f"every other signal in [signals], as {signal} is the first"
-    return f'{late}: write delay = "{value} ms" under {place}'
+    return f'write delay = "{_delay_numbers(tracked)[0]} ms" under {place}'

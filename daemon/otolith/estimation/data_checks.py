@@ -67,7 +67,9 @@ class FaultySensor:
     signal: str
     text: str
     """What is wrong."""
-    advice: str
+    setting: str
+    """What to write into the machine file if the samples are right."""
+    advice: str = ""
     """What to do about it."""
 
 
@@ -263,8 +265,8 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
         runs = _constant_runs(channel.values, channel.present)
         is_long = _samples_in(runs) > MAX_FROZEN_SHARE * len(channel.present)
         if is_long and (run := _frozen_run(channel, runs)) is not None:
-            advice = _turned_off(channel.name, Check.FROZEN)
-            faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), advice))
+            setting = _turned_off(channel.name, Check.FROZEN)
+            faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), setting))
     return faulty
 
 
@@ -318,7 +320,7 @@ def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
         f"{name} is clipped at {limit:.4g} {unit_text(channel.output.unit)} from {when}: "
         f"{_samples_in(runs)} of {window.records} records do not count"
     )
-    return FaultySensor(name, text, f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}")
+    return FaultySensor(name, text, _turned_off(name, Check.FROZEN), "look at the range of the sensor")
 
 
 def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices], float]:

@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from otolith.health.limits import MonitoredQuantity
+from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import FindingKind, Language
 from otolith.health.text import Texts, texts_in
 from otolith_drivers.config_files import Range, StrictModel
@@ -28,7 +28,7 @@ class FindingFeatures:
     twin: str = ""
     subject: str = ""  # Parameter, site or signal
     side: str = ""  # Of the nominal value on which a parameter is: below or above
-    manner: str = ""  # How a parameter came there: by a step or by a trend
+    manner: str = ""  # How a parameter came there, by a step or by a trend; or that it was so from the start
     family: str = ""
     input: str = ""  # t, angle, or another signal or state
     order: float | None = None  # Of a component that is periodic in an angle
@@ -43,11 +43,11 @@ class _Row(StrictModel):
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
     side: tuple[Literal["below", "above"], ...] = ()
-    manner: tuple[Literal["step", "trend"], ...] = ()
+    manner: tuple[Literal["step", "trend", "from the start"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
     order: Range | None = None  # Lowest and highest order
-    severity: Literal["WATCH", "ACT"] = "WATCH"  # Level of what has no limits
+    severity: Literal["HINT", "WATCH", "ACT"] = "WATCH"  # Level of what has no limits
 
 
 class OwnRule(_Row):
@@ -138,7 +138,7 @@ def diagnose(rules: Sequence[Rule], features: FindingFeatures, texts: Texts | No
     return {"condition_id" if key == "id" else key: text for key, text in joined.items() if rows}
 
 
-def severity(rules: Sequence[Rule], features: FindingFeatures) -> Literal["WATCH", "ACT"]:
-    """Return the level of a finding without limits: ACT if each row that matches has it."""
-    rows = matching(rules, features)
-    return "ACT" if rows and all(rule.severity == "ACT" for rule in rows) else "WATCH"
+def severity(rules: Sequence[Rule], features: FindingFeatures) -> Level:
+    """Return the level of a finding without limits: ACT or HINT if each row that matches has it."""
+    levels = {Level(rule.severity) for rule in matching(rules, features)}
+    return levels.pop() if len(levels) == 1 else Level.WATCH

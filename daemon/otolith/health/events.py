@@ -42,6 +42,7 @@ from otolith.health.schema import (
 )
 from otolith.health.text import PARTS, duration_text
 
+KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
 OF_DATA = ("data", "source/", "temperature/", OUTPUT)  # Begins of the keys of conditions that nothing was learned for
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
@@ -94,6 +95,9 @@ class HealthState:
     inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
     doubtful: tuple[int, ...] = ()  # Indices of those of the last windows that contradicted what was known
     agreed: int = -1  # Index of the last window that agreed with it
+    as_stated: int = 0  # Windows in which the signals determined every parameter and were as the machine file says
+    known_since: float | None = None
+    """Service time, s, at which these were enough: what begins later is a change. None before."""
     document: HealthDocument | None = None  # The states in the report before
     dropped: tuple[EventDocument, ...] = ()
     """Events that nothing is known of any more, each with its ``reason``; the next report clears them."""
@@ -120,6 +124,11 @@ class HealthState:
         records = {key: record for key, record in self.records.items() if key not in keys}
         events = [record.event for key, record in self.records.items() if key in keys and record.event is not None]
         return replace(self, records=records).with_dropped(events, reason)
+
+    def without_hints(self, reason: str) -> "HealthState":
+        """Return the state for another machine file, of which nothing is known to be wrong."""
+        keys = [key for key, record in self.records.items() if record.event is not None and record.event.is_hint]
+        return replace(self.without_events(keys, reason), as_stated=0, known_since=None)
 
     def agreeing(self, published: Mapping[str, EventDocument], reason: str) -> "HealthState":
         """Return the state with no other open events than were ``published``, by id the last change of each.
@@ -149,7 +158,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     report = report.model_copy(update={"parameters": parameters})
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
-    state = _with_doubts(replace(state, undetermined=undetermined), report)
+    state = _with_agreement(_with_doubts(replace(state, undetermined=undetermined), report), report)
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events, absent = {}, list[EventDocument](), set[str]()
     for key, observed in observations.items():
@@ -165,7 +174,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
             records[key] = record
     events += [_ended(plan, event, report.window.start) for event in state.dropped]
     events.sort(key=lambda event: -event.state.rank)
-    current = [event for event in events if event.end is None and event.id not in absent]
+    current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=())
@@ -199,7 +208,8 @@ def _observations(
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
-    shown = observe(plan, report, levels, Past(state.steps, spans, state.undetermined, state.doubtful))
+    past = Past(state.steps, spans, state.undetermined, state.doubtful, state.known_since)
+    shown = observe(plan, report, levels, past)
     return earlier | {item.key: item for item in shown}
 
 
@@ -226,6 +236,19 @@ def _with_doubts(state: HealthState, report: ReportDocument) -> HealthState:
     return replace(state, doubtful=doubtful)
 
 
+def _with_agreement(state: HealthState, report: ReportDocument) -> HealthState:
+    """Return the state with whether the signals have been as the machine file says for long enough to know that.
+
+    A window that does not determine every parameter may hide a delay, as one at a constant speed does.
+    """
+    is_as_stated = report.decision is WindowDecision.LEARNED and report.fit is not None and report.fit.explained
+    is_rich = all(item.status is Status.ESTIMATED for item in report.parameters.values())
+    if state.known_since is not None or not is_as_stated or not is_rich:
+        return state
+    count = state.as_stated + 1
+    return replace(state, as_stated=count, known_since=report.window.end if count >= KNOWN_WINDOWS else None)
+
+
 def _from_start(observed: Observation) -> Observation:
     """Return the observation of a condition that was never at OK: a parameter that is beyond its limit is no wear."""
     if observed.features.finding is not FindingKind.LIMIT:
@@ -246,7 +269,7 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
     absent = report.window.absent and {name: local(text) for name, text in report.window.absent.items()}
     changed = {
         "window": report.window.model_copy(update={"quality": quality, "absent": absent}),
-        "findings": tuple(localised(item, "condition", "text", "advice") for item in report.findings),
+        "findings": tuple(localised(item, "condition", "text", "advice", "setting") for item in report.findings),
         "parameters": {name: localised(item, "reason", "advice") for name, item in report.parameters.items()},
         "components": tuple(localised(item, "meaning", "conditions", "domain") for item in report.components),
     }
@@ -319,7 +342,7 @@ def _advance(
 ) -> ConditionRecord:
     """Return the record after an observation, with its event; one that the window clears has an end."""
     event = before.event and before.event.model_copy(update={"change": None})
-    if observed.level is None:
+    if observed.level is None or (before.level is Level.HINT and observed.level is Level.OK):  # a hint is given once
         is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
         return replace(before, event=event, recent=() if is_interrupted else before.recent)
     persistence = observed.persistence
@@ -394,6 +417,7 @@ def _description(
     texts |= {"language": plan.language, **diagnose(plan.rules, observed.features, plan.texts)}
     texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
     numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
+    texts["setting"] = observed.setting
     return {**texts, "text": observed.text, "evidence": event.evidence.model_copy(update=numbers)}
 
 

@@ -22,6 +22,7 @@ class Level(StrEnum):
     """State of a part or of the machine."""
 
     OK = "OK"
+    HINT = "HINT"  # Only the machine file is wrong: a matter of the specialist, and the state of no part
     NO_DATA = "NO DATA"  # Nothing is known at present
     WATCH = "WATCH"
     ACT = "ACT"

@@ -31,7 +31,14 @@ DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
 DAEMON, OUTPUT = "daemon", "output/"  # part to which an output belongs that does not work, and begin of its key
 CLOCK = "clock"  # of the computer: it has events, and no state
-PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}  # Of findings about no part
+PARTS = {
+    FindingKind.SENSOR: SENSORS,
+    FindingKind.NOISE: SENSORS,
+    FindingKind.TIMING: BUS,
+    FindingKind.POLLED: BUS,
+}
+"""Of the findings that are about no part of the twin."""
+FROM_START = "from the start"  # Manner of what was so before the signals agreed with the machine file for long
 NOTHING = FindingFeatures(FindingKind.OPEN)
 
 
@@ -59,6 +66,7 @@ class Observation:
     features: FindingFeatures = NOTHING
     text: str = ""
     advice: str = ""  # Beside that of the rules
+    setting: str = ""  # See EventDocument.setting
     since: float | None = None  # Service time, s; None for the first window that shows it
     numbers: Mapping[str, float | str] | None = None  # For the evidence of the event
     persistence: Persistence = Persistence()
@@ -72,6 +80,7 @@ class Past:
     spans: Mapping[str, float]  # Length of the history of each, s
     undetermined: Mapping[str, float]  # Time for which the machine has moved since each was determined, s
     doubtful: tuple[int, ...] = ()  # See HealthState.doubtful
+    known_since: float | None = None  # See HealthState.known_since
 
 
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
@@ -97,7 +106,8 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
-            observations.append(_of_finding(plan, report.twin, finding, before.get(finding.id, Level.OK)))
+            level = before.get(finding.id, Level.OK)
+            observations.append(_of_finding(plan, report.twin, finding, level, past.known_since))
     return observations
 
 
@@ -126,7 +136,7 @@ def _of_returns(
     begins = [index for index in doubtful if index - 1 not in doubtful]
     is_shown = len(begins) >= MIN_RETURNS and doubtful[-1] == report.window.index
     of_machine = [level for name, level in before.items() if name != key and not name.startswith(OUTPUT)]
-    if not is_shown or any(level is not Level.OK for level in of_machine):
+    if not is_shown or any(level not in (Level.OK, Level.HINT) for level in of_machine):
         return Observation(key, MACHINE, None if doubtful else Level.OK, features, persistence=once)
     seconds = (report.window.end - report.window.start) * (doubtful[-1] - begins[0] + 1)
     causes = next((item.text for item in report.findings if item.kind is not FindingKind.COMPONENT), "")
@@ -134,11 +144,14 @@ def _of_returns(
     return Observation(key, MACHINE, Level.WATCH, features, text, since=report.window.end - seconds, persistence=once)
 
 
-def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:
+def _of_finding(
+    plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level, known_since: float | None
+) -> Observation:
     """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
-    features = FindingFeatures(finding.kind, twin, finding.subject)
+    is_from_start = finding.of_file or known_since is None or finding.since < known_since
+    features = FindingFeatures(finding.kind, twin, finding.subject, manner=FROM_START if is_from_start else "")
     part = PARTS.get(finding.kind, MACHINE)
-    level = Level(severity(plan.rules, features))
+    level = severity(plan.rules, features)
     meaning, numbers = plan.signals.get(finding.subject, ""), None
     text = f"{plan.texts.translated(meaning)}: {finding.text}" if meaning else finding.text
     if (value := finding.value) is not None:
@@ -154,7 +167,8 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
         interval = interval_text(value.value, value.sd, value.unit)
         text = plan.texts("moved", **what, value=interval, stated=quantity_text(quantity.nominal, value.unit))
     persistence = PERSISTENCE.get(finding.kind, Persistence())
-    return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
+    shown = Observation(finding.id, part, level, features, text, finding.advice, finding.setting, finding.since)
+    return replace(shown, numbers=numbers, persistence=persistence)
 
 
 def _of_parameter(
@@ -211,7 +225,7 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
     expected = forecast_text(parameter, report.window.end, plan.language)
     what = plan.texts.translated(quantity.meaning)
     text = plan.texts("trend", what=what, name=name, value=value_text(parameter), expected=expected)
-    return Observation(key, quantity.part, Level(severity(plan.rules, features)), features, text)
+    return Observation(key, quantity.part, severity(plan.rules, features), features, text)
 
 
 def _of_lost(
@@ -288,7 +302,7 @@ def _of_component(
     if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
         level, limit = quantity.level(size, amplitude.sd, before.get(key, Level.OK))
     elif size > QUANTILE * amplitude.sd and not is_expected:
-        level = Level(severity(plan.rules, features))
+        level = severity(plan.rules, features)
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
     what = {"what": component.meaning, "equation": equation_text(component.equation), "value": interval}
     beside = f", {_beside(limit, size, amplitude.unit, plan.texts)}" if limit else ""

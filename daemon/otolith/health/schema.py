@@ -31,6 +31,7 @@ class FindingKind(StrEnum):
     SENSOR = "sensor"
     TIMING = "late signal"
     NOISE = "noise"
+    POLLED = "polled command"  # A command changes between its samples, and the machine file does not say so
     CLASS = "class"  # Several hypotheses explain the windows equally well
     OPEN = "open"  # Hypotheses are being compared
     MOVED = "moved"  # A parameter that the machine file gives as known is another
@@ -106,6 +107,8 @@ class FindingDocument(DocumentModel):
     text: str
     since: float  # Unix seconds
     advice: str = ""
+    setting: str = ""  # What to write into the machine file if it is wrong and the machine is not; for the specialist
+    of_file: bool = False  # Whether it shows that the machine file is wrong, whatever happens to the machine
 
 
 class EventChange(StrEnum):
@@ -145,6 +148,7 @@ class EventDocument(DocumentModel):
     text: str
     cause: str = ""
     advice: str = ""
+    setting: str = ""  # What to write into the machine file if it is wrong and the machine is not; for the specialist
     source: str = ""
     reason: str | None = None  # Why it is cleared although nothing shows that it is over: its learned state was dropped
     language: Language = "en"  # Of condition, text, cause, advice and reason
@@ -154,6 +158,11 @@ class EventDocument(DocumentModel):
     def is_urgent(self) -> bool:
         """Whether its part is at :attr:`Level.ACT` because of it."""
         return self.state is Level.ACT and self.end is None
+
+    @property
+    def is_hint(self) -> bool:
+        """Whether only the machine file is wrong, so that it concerns nobody but the specialist."""
+        return self.state is Level.HINT
 
 
 class PartDocument(DocumentModel):
@@ -341,6 +350,16 @@ class ReportDocument(DocumentModel):
     counters: CountersDocument | None = None
     driver: DriverDocument | None = None  # None in a replay
     notes: tuple[str, ...] = ()  # About the daemon since its start: which saved state it could not use, and why
+
+    @property
+    def open_events(self) -> tuple[EventDocument, ...]:
+        """The events that are not cleared, without hints; most severe first."""
+        return tuple(event for event in self.events if event.end is None and not event.is_hint)
+
+    @property
+    def hints(self) -> tuple[EventDocument, ...]:
+        """What is wrong in the machine file."""
+        return tuple(event for event in self.events if event.end is None and event.is_hint)
 
     def to_json(self) -> str:
         """Return the published JSON in one line: ``schema`` first, absent keys where there is no content."""

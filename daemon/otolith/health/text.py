@@ -132,7 +132,7 @@ def approval_text(component: ComponentDocument, texts: Texts) -> str:
 
 def finding_text(finding: FindingDocument) -> str:
     """Severity, text and advice of a finding."""
-    return "; ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
+    return "; ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice, finding.setting]))
 
 
 def moment_text(seconds: float) -> str:
@@ -140,8 +140,11 @@ def moment_text(seconds: float) -> str:
     return re.sub(r"\.\d+ UTC$", " UTC", time_text(seconds))
 
 
-def event_text(event: EventDocument, when: Callable[[float], str] = moment_text) -> str:
-    """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
+def event_text(event: EventDocument, when: Callable[[float], str] = moment_text, *, details: bool = False) -> str:
+    """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text.
+
+    With ``details`` also what to write into the machine file, as the specialist reads it.
+    """
     texts = texts_in(event.language)
     part, condition = texts.translated(event.part), event.condition
     if event.change is EventChange.NOTED:
@@ -150,7 +153,7 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text)
         line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
         return f"{line}; {texts('dropped', reason=event.reason)}" if event.reason else line
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
-    advice = f"; {event.advice}" if event.advice else ""
+    advice = "".join(f"; {text}" for text in (event.advice, event.setting if details else "") if text)
     state, since = texts.translated(event.state), when(event.since)
     values = {"state": state, "part": part, "condition": condition, "since": since, "text": event.text}
     return texts("event", **values, sure=sure, advice=advice)

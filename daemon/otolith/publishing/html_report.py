@@ -136,7 +136,8 @@ def html_report(
     until = latest.window.end if latest and not is_silent and silence > -DAY else now
     axis = _axis(min(begin, until - 1.0), until, latest)
     gaps = _gaps(sorted({row.time for row in rows}), length) + ([(latest.window.end, until)] if latest else [])
-    events = _events(reader, latest, since)
+    told = _events(reader, latest, since)
+    events = [row for row in told if row[1] is not Level.HINT]
     urgent = {event.id.rpartition("@")[0] for event, _, _ in events if event.end is None}
     curves = list(_curves(axis, gaps, rows, latest, description))
     curves.sort(key=lambda row: not urgent & {f"limit/{row.name}", f"component/{row.name.rpartition('/')[0]}"})
@@ -157,7 +158,8 @@ def html_report(
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
         zone=zone, lanes=list(_lanes(axis, latest, states)), curves=curves, is_over=is_over,
         gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,
-        findings=reader.findings(since), undetermined=_undetermined(reports), equations=_equations(latest, description),
+        hints=[event for event, worst, _ in told if worst is Level.HINT], findings=reader.findings(since),
+        undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
     )  # fmt: skip
 

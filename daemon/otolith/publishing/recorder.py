@@ -64,6 +64,7 @@ NEAR_VALUES = 2.0  # times the distance of the value from the nominal value, the
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 STATES = {
     Level.OK: [46, 125, 50],
+    Level.HINT: [60, 110, 160],
     Level.NO_DATA: [110, 110, 110],
     Level.WATCH: [200, 140, 0],
     Level.ACT: [198, 40, 40],
@@ -273,6 +274,8 @@ class Recording:
     def _add_state(self, document: ReportDocument, end: Times) -> None:
         """Append events and states of the operator's tab, where they have changed."""
         for event in announcements(document):
+            if event.is_hint:
+                continue  # the log of the engineer's tab has it
             self._rows[EVENTS].append((end, (event_text(event), "ERROR" if event.is_urgent else "WARN")))
         health = document.health
         parts = {} if health is None else {MACHINE: health, **health.parts}
@@ -358,7 +361,7 @@ def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
         if parameter.status is not Status.ESTIMATED and not reasons:
             yield f"{name} {parameter.status}: {parameter.reason}", "INFO"
     for event in announcements(document):
-        yield event_text(event), "ERROR" if event.is_urgent else "WARN"
+        yield event_text(event, details=True), "ERROR" if event.is_urgent else "INFO" if event.is_hint else "WARN"
     if document.fit is not None and not document.fit.explained:
         yield "the twin does not explain the window up to the noise", "INFO"
 
@@ -396,7 +399,7 @@ def operator_text(document: ReportDocument) -> str:
     if (health := document.health) is None:
         return f"# {document.machine}"
     texts = texts_in(health.language)
-    current = [event for event in document.events if event.end is None]
+    current = document.open_events
     lines = [f"# {texts.translated(state_word(health))}"]
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
@@ -430,7 +433,7 @@ def report_text(document: ReportDocument) -> str:
     """Return the report as tables in Markdown."""
     texts = texts_in("en" if document.health is None else document.health.language)
     rows = [f"# {document.machine}, {document.site}", ""]
-    current = [event for event in document.events if event.end is None]
+    current = document.open_events
     rows += [] if document.health is None else [_plain(headline(document.health, events=current)), ""]
     say, columns = texts.translated, "| {} | {} | {} |\n|---|---|---|"
     rows += [columns.format(say("parameter"), say("value"), say("status"))]
@@ -446,7 +449,7 @@ def report_text(document: ReportDocument) -> str:
             f"{_plain(f'{say(row.status)}, {approval_text(row, texts)}')} |"
             for row in document.components
         ]
-    rows += [f"\n{_plain(event_text(event))}" for event in current]
+    rows += [f"\n{_plain(event_text(event, details=True))}" for event in (*current, *document.hints)]
     return "\n".join(rows)
 
 

@@ -460,11 +460,13 @@ class Service:
     def _log(self, document: ReportDocument, now: float) -> None:
         """Log the events that the window changed, and run the command for each; log the window once per hour.
 
-        In a terminal each window is logged.
+        Hints concern nobody whom the command calls. In a terminal each window is logged.
         """
         for event in announcements(document):
-            log.log(logging.ERROR if event.is_urgent else logging.WARNING, "%s", event_text(event))
-            self._command.run(event)
+            level = logging.ERROR if event.is_urgent else logging.INFO if event.is_hint else logging.WARNING
+            log.log(level, "%s", event_text(event, details=True))
+            if not event.is_hint:
+                self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
         if is_due and self._publisher is not None:

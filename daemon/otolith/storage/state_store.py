@@ -251,7 +251,7 @@ class StateStore:
                 return replace(state, health=health), reason, False
             if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
                 reason = "parameters or noise in the machine file have changed since it was saved"
-                learned = learned.model_copy(update={"filter": None})
+                learned = learned.model_copy(update={"filter": None, "health": learned.health.without_hints(reason)})
             return restored(learned, state), reason, False
         except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
             reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")

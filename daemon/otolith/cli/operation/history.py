@@ -422,7 +422,7 @@ def reproduce(bundle: Path, as_json: bool) -> int:
     span = read.windows[0].window.start, last.end
     tell(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(when, span))}")
     for event in read.events:
-        tell(f"{'' if event.end else f'{event.change}: '}{event_text(event, when)}")
+        tell(f"{'' if event.end else f'{event.change}: '}{event_text(event, when, details=True)}")
     tell(f"seed {state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
     with progress_line("reproducing") as show:
         difference = _first_difference(read, show, echo if as_json else lambda _: None)

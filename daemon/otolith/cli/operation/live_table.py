@@ -26,6 +26,7 @@ from otolith.health.text import (
     Texts,
     approval_text,
     duration_text,
+    event_text,
     forecast_text,
     headline,
     interval_text,
@@ -56,7 +57,14 @@ STYLES = {
     Status.INVALID: "red",
     Status.UNESTIMATED: "dim",
 }
-LEVEL_STYLES = {Level.OK: "bold green", Level.NO_DATA: "bold dim", Level.WATCH: "bold yellow", Level.ACT: "bold red"}
+HINT_STYLE = "cyan"
+LEVEL_STYLES = {
+    Level.OK: "bold green",
+    Level.HINT: HINT_STYLE,
+    Level.NO_DATA: "bold dim",
+    Level.WATCH: "bold yellow",
+    Level.ACT: "bold red",
+}
 VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
 RIGHT = {"value", "± 95 %", "change"}
 # Engineering choices without a test of their own.
@@ -94,8 +102,8 @@ class _Machine:
         document, texts = self.document, texts_of(self.document)
         table = _parameters(document.parameters, self.histories, width, texts)
         if in_short:
-            return [*state_lines(document), table, Text()]
-        parts: list[RenderableType] = [*state_lines(document), *_title_lines(document, texts), table]
+            return [*state_lines(document, details=details), table, Text()]
+        parts: list[RenderableType] = [*state_lines(document, details=details), *_title_lines(document, texts), table]
         parts += [_components(document, width, texts)] if document.components else []
         return [*parts, *_messages(document, texts, details=details), *_counters(document, texts)]
 
@@ -176,15 +184,18 @@ def event_style(event: EventDocument) -> str:
     return LEVEL_STYLES[event.state if event.end is None else Level.OK]
 
 
-def state_lines(document: ReportDocument) -> list[Text]:
-    """State of the machine, then its parts, then of each event that is not cleared: what, how sure, and what to do."""
+def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text]:
+    """State of the machine, then its parts, then of each event that is not cleared: what, how sure, and what to do.
+
+    With ``details`` also the hints, and what to write into the machine file.
+    """
     if (health := document.health) is None:
         return []
     texts, parts = texts_of(document), Text()
     say = texts.translated
     for name, part in health.parts.items():
         parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
-    current = [event for event in document.events if event.end is None]
+    current = document.open_events
     is_in_headline = len(current) == 1  # several events have a line each instead
     own_lines = () if is_in_headline else current
     lines = [Text(headline(health, local_time, own_lines), style=LEVEL_STYLES[health.state]), parts]
@@ -197,7 +208,9 @@ def state_lines(document: ReportDocument) -> list[Text]:
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
         lines.append(Text(f"{event.text}{sure}"))
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
-    return lines
+        lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
+    hints = document.hints if details else ()
+    return [*lines, *(Text(event_text(event, local_time, details=True), style=HINT_STYLE) for event in hints)]
 
 
 def parameter_table(*columns: str, width: int, texts: Texts | None = None) -> Table:
@@ -271,7 +284,7 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
 def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[Text]:
     """Reasons, advice, and how well the twin explains the window.
 
-    While it is open which cause holds, reasons and advice are about the candidates: they are details.
+    While it is open which cause holds, or the machine file has to be corrected, reasons and advice are details.
     """
     bad = document.window.quality.reasons
     lines = [Text(f"{texts('bad_window')}: {reason}", style="red") for reason in bad]
@@ -279,7 +292,7 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         if expected := forecast_text(parameter, document.window.end, texts.language):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
     candidates = [finding for finding in document.findings if finding.kind is FindingKind.OPEN]
-    if candidates and not details:
+    if (candidates or document.hints) and not details:
         return lines
     for key, style in (("reason", "yellow"), ("advice", "cyan"))[bool(bad) :]:
         names: dict[str, list[str]] = {}
@@ -288,8 +301,7 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         lines += [Text(f"{', '.join(own)}: {text}", style=style) for text, own in names.items() if text]
     for finding in candidates:
         lines.append(Text(f"{texts('open_test')}: {finding.text}", style="magenta"))
-        if finding.advice:
-            lines.append(Text(f"  {finding.advice}", style="cyan"))
+        lines += [Text(f"  {text}", style="cyan") for text in (finding.advice, finding.setting) if text]
     if document.fit is not None:
         units, rows = document.fit.units, document.fit.rmse_estimated.items()
         errors = ", ".join(f"{name} {quantity_text(value, units.get(name, '1'), digits=3)}" for name, value in rows)
