@@ -27,7 +27,7 @@ MOTOR, ALL = find_twin("dc_motor"), ("R_a", "L_a", "J", "D")
 DEVIATIONS = 4.0  # standard deviations: several hundred values are compared
 ROWS, SLOW_OMEGA = Schedule(rows=Timing(0.01)), Schedule(omega=Timing(0.05))
 FINDING = re.compile(
-    r'(\w+) is ([\d.]+) ms late \(([\d.]+) to ([\d.]+)\); write delay = "([\d.]+) ms" under \[signals\]'
+    r'(\w+) is ([\d.]+) ms late \(([\d.]+) to ([\d.]+)\).*; write delay = "([\d.]+) ms" under \[signals\]'
 )
 
 

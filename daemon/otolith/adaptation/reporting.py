@@ -174,14 +174,7 @@ def make_report(
         findings=(
             *(_sensor_finding(sensor, window.start) for sensor in result.faulty_sensors),
             *(_polled_finding(command, window.start) for command in problem.changing),
-            *_findings(
-                components,
-                undecided,
-                result,
-                result.noisier_since(state),
-                _experiment(undecided, situation),
-                window.start,
-            ),
+            *_findings(components, undecided, result, result.noisier_since(state), _experiment(undecided, situation)),
         ),
         **_fit_and_cost(problem, result),
     )
