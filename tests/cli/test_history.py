@@ -183,12 +183,12 @@ def test_a_wrong_argument_names_the_way_out(written: HistoryWriter, arguments: t
     assert message in getattr(error, "message", str(error))
 
 
-def test_machines_of_one_name_ask_for_the_file(written: HistoryWriter) -> None:
+def test_machines_of_one_name_ask_for_the_site(written: HistoryWriter) -> None:
     path = written.reader.path
     path.with_name(f"hall-2.{MACHINE}.history.sqlite").write_bytes(b"")
     error = run(MACHINE).exception
     assert isinstance(error, ConfigurationError)
-    assert "hall-1, hall-2: give the machine file" in str(error)
+    assert "hall-1.press-3, hall-2.press-3: give one of these names" in str(error)
 
 
 def test_a_history_of_another_version_is_not_read(written: HistoryWriter) -> None:

@@ -125,8 +125,8 @@ def test_each_machine_has_its_own_table_and_curves() -> None:
     blocks = [block for block in text.split("\n\n") if "R_a" in block]
     assert [block.split()[0] for block in blocks] == [first.machine, "press-9"]
     assert [block.count(BARS[4]) for block in blocks] == [1, 2]  # a point per report of that machine
-    assert "--machine NAME" in text
-    assert "--machine NAME" not in drawn(first)
+    assert "otolith watch MACHINE" in text
+    assert "otolith watch MACHINE" not in drawn(first)
 
 
 @pytest.mark.parametrize("width", [40, 60, 70, 80])

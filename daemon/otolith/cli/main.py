@@ -62,10 +62,12 @@ def _new_recording(context: click.Context, option: click.Parameter, path: Path |
     return new_file(context, option, path)
 
 
-def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_\-*]+", name):
-        raise click.BadParameter(f"{name!r} is no machine name: use letters, digits, '_', '-' and '*'")
-    return name
+def _watched(_: click.Context, __: click.Parameter, text: str) -> str:
+    from otolith.cli.machines import is_file, key_of
+
+    if not is_file(text) and not re.fullmatch(r"[A-Za-z0-9_\-*]+(\.[A-Za-z0-9_\-*]+)?", text):
+        raise click.BadParameter(f"{text!r} is no machine name: use letters, digits, '_', '-' and '*'")
+    return key_of(text)
 
 
 @contextmanager
@@ -216,8 +218,8 @@ def replay(
 
 
 @cli.command()
+@click.argument("machine", metavar="[FILE|MACHINE]", default="*", callback=_watched)
 @reader_options
-@click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
 @click.option("--details", is_flag=True, help="Also show the candidates while a cause is not yet known.")
 @click.option("--after", type=click.IntRange(0), metavar="NUMBER",
@@ -227,6 +229,7 @@ def watch(
 ) -> int:
     """Show the live table of running daemons, over Zenoh.
 
+    MACHINE is the name of one, with or without its site, FILE its machine file; without it, all are shown.
     With --json each report is printed once and in order, also those that were
     published while the connection was down.
     Each of the options to connect can also be set in the environment, such as OTOLITH_CA for --ca.
@@ -234,9 +237,10 @@ def watch(
     \b
     Examples:
       otolith watch
+      otolith watch press-3
       otolith watch --connect tls/press-3.local:7447 --ca ca.crt
       otolith watch --json | jq .parameters.R_a
-      otolith watch --json --machine press-3 --after 1790000000000
+      otolith watch press-3 --json --after 1790000000000
     """
     if after is not None and not as_json:
         raise click.UsageError("--after needs --json")

@@ -121,7 +121,9 @@ class Subscriber:
         topics: tuple[Topic, ...] = (REPORT,),
         after: int | None = None,
     ) -> None:
-        """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``.
+        """Begin after a sequence number, or without it with the latest report.
+
+        ``machine`` is the name of one, with or without its site and a point before it, or ``*``.
 
         Without endpoints it reads all daemons on this computer that this user may read.
 
@@ -132,7 +134,8 @@ class Subscriber:
         self._waiting: queue.Queue[tuple[str, str | None]] = queue.Queue(MAX_BEHIND)
         self._stopping, self._is_behind = threading.Event(), threading.Event()
         self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after, topics)
-        self._machine, self._from_now = machine, after is None
+        site, _, name = machine.rpartition(".")
+        self._site, self._machine, self._from_now = site or "*", name, after is None
         self._endpoints = connection.endpoints
         self._settings = reader_settings(connection.credentials, connection.endpoints)
         self._sessions: dict[str, zenoh.Session] = {}
@@ -150,7 +153,7 @@ class Subscriber:
         """Return what it waits for, in words."""
         addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
         if self.connected:
-            reports = REPORT.under("*", self._machine)
+            reports = REPORT.under(self._site, self._machine)
             return f"connected, no report yet; if none comes, this reader may not read {reports} ({addresses})"
         if addresses:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
@@ -188,8 +191,8 @@ class Subscriber:
 
     def _declare(self, opened: zenoh.Session) -> None:
         for topic in {REPORT, *self._topics}:  # a report also shows from where on events can be missing
-            self._declared.append(opened.declare_subscriber(topic.under("*", self._machine), self._receive))
-        alive = ALIVE.under("*", self._machine)
+            self._declared.append(opened.declare_subscriber(topic.under(self._site, self._machine), self._receive))
+        alive = ALIVE.under(self._site, self._machine)
         self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
 
     def _receive(self, sample: zenoh.Sample) -> None:

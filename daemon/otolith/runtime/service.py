@@ -437,7 +437,8 @@ class Service:
         """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
         plan = self._supervisor.state.plan
         if self._history is not None and plan != self._described:
-            self._history.description, self._described = describe_machine(self._machine.twin, plan), plan
+            text = describe_machine(self._machine.twin, plan, file=self._machine.path)
+            self._history.description, self._described = text, plan
 
     def _counters(self) -> CountersDocument:
         rings, driver = self._rings.counters(), self._machine.driver.counters()

@@ -105,10 +105,13 @@ def path_in(folder: Path, site: str, machine: str) -> Path:
     return folder / f"{site}.{machine}{SUFFIX}"
 
 
-def describe_machine(twin: Definition, plan: MonitoringPlan, log: Mapping[str, Any] | None = None) -> str:
+def describe_machine(
+    twin: Definition, plan: MonitoringPlan, log: Mapping[str, Any] | None = None, file: Path | None = None
+) -> str:
     """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter.
 
     ``log`` tells of the data that were replayed: ``files``, their names, and ``warnings``, what a reader must know.
+    ``file`` is the machine file, by which commands find it that are given the name of the machine.
     """
     sides = [(name, text) for name, text, _ in twin.definitions]
     values = {row.name: (row.nominal, row.unit, row.meaning) for row in twin.parameters if row.role is not Role.SETTING}
@@ -116,6 +119,7 @@ def describe_machine(twin: Definition, plan: MonitoringPlan, log: Mapping[str, A
               for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
+    texts |= {} if file is None else {"file": str(file.absolute())}
     return json_text({**texts, "values": values, "limits": limits, "sites": sites})
 
 
@@ -123,6 +127,7 @@ class _Description(BaseModel):
     """What :func:`describe_machine` writes; other versions may write less, or more."""
 
     title: str = ""
+    file: str = ""
     equations: tuple[tuple[str, str], ...] = ()
     values: dict[str, tuple[float | None, str, str]] = Field(default_factory=dict)
     limits: dict[str, tuple[tuple[Level, float, bool], ...]] = Field(default_factory=dict)

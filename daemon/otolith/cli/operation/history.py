@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import re
 import sys
 import time
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from otolith.cli.common import AS_JSON, DEMOS, FILE, local_time, new_file, progress_line, use_state_of_service
+from otolith.cli.common import AS_JSON, FILE, local_time, new_file, progress_line
+from otolith.cli.machines import reader_of
 from otolith.cli.terminal import echo, echo_csv, echo_json
 
 if TYPE_CHECKING:
@@ -82,7 +82,8 @@ def history(
 ) -> None:
     """Show what was estimated and announced before.
 
-    FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
+    FILE is the machine file, MACHINE the name in it, with or without its site.
+    A daemon may run meanwhile.
     FILE may also be a history, like one that was set aside or copied: *.sqlite.
     Windows are kept for a day, minutes for 14 days, hours for a year, days and
     events for ten years, unless the machine file has other limits.
@@ -116,52 +117,6 @@ def history(
         _print_json(reader, interval, begin, samples, events)
     else:
         _print_table(reader, interval, begin, samples, events, details=details, has_findings=only_events or not names)
-
-
-def reader_of(machine: str) -> "HistoryReader":
-    """Return the history in a file, of a machine file, or of a machine by its name or that of its service.
-
-    If there is none of that name, it is that of the last demo, which is said on standard error.
-
-    Raises:
-        ConfigurationError: the file is wrong, or there is no history, or several, of that name.
-    """
-    from otolith.storage.history import SUFFIX, HistoryReader, history_directory, history_path
-    from otolith_drivers.errors import ConfigurationError, nearest
-
-    if machine.endswith(".sqlite"):
-        return HistoryReader.of_file(Path(machine))
-    if machine.endswith(".toml") or "/" in machine or Path(machine).is_file():
-        from otolith.machine import load_machine
-
-        use_state_of_service(Path(machine))
-        names = load_machine(Path(machine), with_driver=False).file.machine
-        return HistoryReader(history_path(names.site, names.name))
-    known = [HistoryReader(path) for path in sorted(history_directory().glob(f"*{SUFFIX}"))]
-    is_instance = Path(os.environ.get("STATE_DIRECTORY", "")).name == machine  # which systemd names so
-    chosen = [reader for reader in known if reader.machine == machine or is_instance]
-    if not chosen and use_state_of_service(machine):
-        return reader_of(machine)
-    if not chosen:
-        demos = {reader.machine: reader for reader in _demos()}  # the last one of each name
-        if machine in demos:
-            echo(f"no machine is named {machine!r}: this is the demo in {demos[machine].path.parents[1]}", err=True)
-            return demos[machine]
-        hint = nearest(machine, [*(reader.machine for reader in known), *demos])
-        raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")
-    if len(chosen) > 1:
-        sites = ", ".join(reader.site for reader in chosen)
-        raise ConfigurationError(f"several machines are named {machine!r}, at {sites}: give the machine file")
-    return chosen[0]
-
-
-def _demos() -> "list[HistoryReader]":
-    """Return the histories that demos left, in the order of time."""
-    from otolith.storage.history import SUFFIX, HistoryReader
-    from otolith_drivers.user_dirs import state_directory
-
-    paths = (state_directory() / DEMOS).glob(f"*/history/*{SUFFIX}")
-    return [HistoryReader(path) for path in sorted(paths)]
 
 
 def _check_names(names: Sequence[str], known: list[str]) -> None:
@@ -337,7 +292,8 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
 def report(machine: str, since: Since, output: Path | None) -> None:
     """Write what was estimated and announced as one HTML page.
 
-    FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
+    FILE is the machine file, MACHINE the name in it, with or without its site.
+    A daemon may run meanwhile.
     The page needs no other file and no network: it can be mailed and printed.
 
     \b

@@ -19,10 +19,12 @@ from rich.text import Text
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import drain, local_time
 from otolith.cli.console import Terminal
+from otolith.cli.machines import last_spoken
 from otolith.cli.terminal import echo
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
 from otolith.health.text import (
+    PARTS,
     Texts,
     approval_text,
     duration_text,
@@ -162,7 +164,7 @@ class LiveTable:
             ]
             unreadable = self._unreadable
         if in_short:
-            parts.append(Text("'--machine NAME' shows more of one machine", style="dim"))
+            parts.append(Text("'otolith watch MACHINE' shows more of one machine", style="dim"))
         if unreadable:
             parts.append(Text(f"{unreadable} reports cannot be read: another version publishes here", style="red"))
         return Group(*parts) if parts else Text(state, style="dim")
@@ -376,10 +378,16 @@ def watch_reports(
 
     with Subscriber(connection, receive, machine, after=after) as subscriber:
         try:
+            spoken = () if connection.endpoints else tuple(last_spoken(machine))  # of the daemons of this computer
+
+            def state() -> str:
+                is_alone = not (subscriber.connected or subscriber.order.keys)
+                return PARTS.join(["no daemon runs", *spoken]) if is_alone and spoken else subscriber.state()
+
             if as_json:
-                _stream(texts, subscriber, stopped)
+                _stream(texts, subscriber, state, stopped)
                 return
-            table = LiveTable(subscriber.state, details=details)
+            table = LiveTable(state, details=details)
             with Live(table, console=Terminal(), refresh_per_second=5):
                 while not stopped():
                     for text in drain(texts, PAUSE):
@@ -388,9 +396,11 @@ def watch_reports(
             ended.set()
 
 
-def _stream(texts: "queue.Queue[str]", subscriber: "Subscriber", stopped: Callable[[], bool]) -> None:
+def _stream(
+    texts: "queue.Queue[str]", subscriber: "Subscriber", state: Callable[[], str], stopped: Callable[[], bool]
+) -> None:
     """Print reports as lines; print to standard error what is missing, and the state while no report comes."""
-    latest, printed, missed, state = time.monotonic(), "", 0, subscriber.state
+    latest, printed, missed = time.monotonic(), "", 0
     refused = named = 0
     while not stopped():
         lines = drain(texts, PAUSE)

@@ -16,10 +16,11 @@ from typing import BinaryIO
 import click
 
 from otolith.cli.common import DEMOS, SERVICES, local_time
+from otolith.cli.machines import is_file, key_of
 from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
-from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith_drivers.errors import ConfigurationError, ServiceError, some_names
 from otolith_drivers.user_dirs import cache_directory, state_directory
 
 MAGIC = b"RRF2"  # first bytes of Rerun's files
@@ -40,7 +41,8 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 def view(recording: str | None, since: Since | None, only_list: bool, live: bool, web: bool) -> int:
     """Open the newest recording, or FILE, in the Rerun viewer.
 
-    MACHINE is the name of the machine that it is of, with or without its site, or an instance of the service.
+    MACHINE is the name of the machine that it is of, with or without its site, its machine file, or an instance of the
+    service.
 
     \b
     Examples:
@@ -51,12 +53,14 @@ def view(recording: str | None, since: Since | None, only_list: bool, live: bool
     """
     if live and (since or only_list):
         raise click.UsageError("--live follows the newest recording: give it without --since and --list")
-    path = Path(recording) if recording and (recording.endswith(".rrd") or Path(recording).is_file()) else None
+    path = Path(recording) if recording and is_file(recording) and not recording.endswith(".toml") else None
+    path = Path(recording) if recording and recording.endswith(".rrd") else path
     if path is not None:
         if since or only_list:
             raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
         return follow(lambda: path, web=web) if live else open_viewer([path], web=web)
-    known, begin = Recordings.search(recording or ""), since.before(time.time()) if since else None
+    machine = key_of(recording) if recording and is_file(recording) else recording or ""
+    known, begin = Recordings.search(machine), since.before(time.time()) if since else None
     files = [file for file in known.files if begin is None or file.end >= begin]
     if only_list:
         width = max((len(file.key) for file in files), default=0)
@@ -66,7 +70,7 @@ def view(recording: str | None, since: Since | None, only_list: bool, live: bool
     if not files:
         raise ConfigurationError(known.none_text(begin))
     if live:
-        return follow(lambda: _newest(recording or "", files[0]), web=web)
+        return follow(lambda: _newest(machine, files[0]), web=web)
     return open_viewer([file.path for file in (files[:1] if since is None else reversed(files))], web=web)
 
 
@@ -105,7 +109,9 @@ class Recordings:
         of = f" of {self.machine}" if self.machine else ""
         span = f" since {local_time(since)}" if since else ""
         where = " and ".join(map(str, self.places))
-        remedy = "'otolith run' makes one, or 'otolith replay --recording FILE.rrd'"
+        others = sorted({file.key for file in Recordings.search("").files if file.key}) if self.machine else []
+        known = f"there are recordings of {some_names(others)}"
+        remedy = known if others else "'otolith run' makes one, or 'otolith replay --recording FILE.rrd'"
         return "; ".join([f"{where}: no recording{of}{span}", *(self.unreadable or (remedy,))])
 
 
