@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 from otolith.cli.main import cli
 from otolith.cli.operation import view as module
 from otolith.cli.operation.view import END, HEADER_BYTES, MAGIC, MESSAGE
+from tests.messages import assert_says
 from tests.waiting import wait_for
 
 STAMP = "%Y%m%dT%H%M%S"
@@ -195,3 +196,22 @@ def test_a_live_view_goes_on_with_what_is_added_and_with_the_next_file(services:
     assert results[0].return_value == 0
     assert arguments_of(shown) == f"{BOUND} --serve-web --web-viewer-port 0 -"
     assert "without --since and --list" in str(run("motor", "--live", "--list").exception)
+
+
+def test_what_to_open_in_a_browser_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Lines of the viewer of Rerun 0.41, with its colours."""
+    address = "http://127.0.0.1:44339?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A9876%2Fproxy"
+    lines = (
+        "\x1b[2m2026-11-27T15:33:58.328606Z\x1b[0m \x1b[32m INFO\x1b[0m \x1b[2mre_importer\x1b[0m: Loading",
+        f"\x1b[2m2026-11-27T15:33:58.376215Z\x1b[0m \x1b[32m INFO\x1b[0m re_sdk: Hosting - connect at {address}",
+        "2026-11-27T15:33:58.376215Z ERROR re_grpc: no port is free",
+    )
+    script = tmp_path / "viewer"
+    script.write_text(f"#!{sys.executable}\nprint({chr(10).join(lines)!r})\n", encoding="utf-8")
+    script.chmod(0o755)
+    with module._started([str(script)], {}, web=True) as viewer:
+        viewer.wait()
+    printed = capsys.readouterr()
+    (line,) = printed.out.splitlines()
+    assert_says(line, f"open {address}", "-L 44339:127.0.0.1:44339", "-L 9876:127.0.0.1:9876")
+    assert printed.err.splitlines() == ["2026-11-27T15:33:58.376215Z ERROR re_grpc: no port is free"]

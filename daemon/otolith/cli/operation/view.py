@@ -3,15 +3,17 @@
 import contextlib
 import getpass
 import os
+import re
 import struct
 import subprocess
 import sysconfig
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import click
 
@@ -27,6 +29,9 @@ MAGIC = b"RRF2"  # first bytes of Rerun's files
 HEADER_BYTES = 12  # before their first message
 MESSAGE = struct.Struct("<QQ")  # before each message: its kind and its length in bytes
 END = 0  # kind of the message that closes a file; an index for random access follows
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+ADDRESS = re.compile(r"connect at (?P<address>http://[\w.]+:(?P<port>\d+)\S*)")  # in the log of the viewer
+QUIET = re.compile(r"^\S+Z +(INFO|DEBUG|TRACE) ")
 LIVE_INTERVAL = 0.5  # s between two looks at a recording that is being written
 LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all interfaces
 
@@ -167,10 +172,12 @@ def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
     command, environment = _viewer(paths[0], web=web)
     with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
         whole = list(_whole(Path(command[0]), paths, Path(folder)))
-        try:
-            return subprocess.run([*command, *map(str, whole)], env=environment, check=False).returncode  # noqa: S603 - our viewer
-        except KeyboardInterrupt:
-            return 0
+        with _started([*command, *map(str, whole)], environment, web=web) as viewer:
+            try:
+                return max(0, viewer.wait())
+            except KeyboardInterrupt:
+                viewer.terminate()
+                return 0
 
 
 def follow(newest: Callable[[], Path], *, web: bool = False) -> int:
@@ -180,19 +187,48 @@ def follow(newest: Callable[[], Path], *, web: bool = False) -> int:
     """
     _check(newest())
     command, environment = _viewer(newest(), web=web)
-    viewer = subprocess.Popen([*command, "-"], env=environment, stdin=subprocess.PIPE)  # noqa: S603 - our viewer
-    assert viewer.stdin is not None  # noqa: S101 - for mypy
-    try:
-        while viewer.poll() is None:
-            with contextlib.suppress(FileNotFoundError), newest().open("rb") as file:  # an event renames it
-                _send(file, viewer, newest)
-            time.sleep(LIVE_INTERVAL)
-    except (BrokenPipeError, KeyboardInterrupt):  # the viewer was closed, or is to be
-        viewer.terminate()
-    finally:
-        with contextlib.suppress(BrokenPipeError):
-            viewer.stdin.close()
-    return max(0, viewer.wait())
+    with _started([*command, "-"], environment, web=web, stdin=subprocess.PIPE) as viewer:
+        assert viewer.stdin is not None  # noqa: S101 - for mypy
+        try:
+            while viewer.poll() is None:
+                with contextlib.suppress(FileNotFoundError), newest().open("rb") as file:  # an event renames it
+                    _send(file, viewer, newest)
+                time.sleep(LIVE_INTERVAL)
+        except (BrokenPipeError, KeyboardInterrupt):  # the viewer was closed, or is to be
+            viewer.terminate()
+        finally:
+            with contextlib.suppress(BrokenPipeError):
+                viewer.stdin.close()
+        return max(0, viewer.wait())
+
+
+@contextlib.contextmanager
+def _started(
+    command: Sequence[str], environment: dict[str, str], *, web: bool, stdin: int | None = None
+) -> "Iterator[subprocess.Popen[bytes]]":
+    """Start the viewer; with ``web`` one line says what to open, in place of its log."""
+    log = subprocess.PIPE if web else None
+    with subprocess.Popen(  # noqa: S603 - our viewer
+        command, env=environment, stdin=stdin, stdout=log, stderr=log and subprocess.STDOUT
+    ) as viewer:
+        if viewer.stdout is not None:
+            reader = threading.Thread(target=_say_address, args=(viewer.stdout,), daemon=True)
+            reader.start()
+        yield viewer
+        if viewer.stdout is not None:
+            reader.join(LIVE_INTERVAL)
+
+
+def _say_address(log: IO[bytes]) -> None:
+    """Print the address that the viewer logs, and how another computer reaches it; of the rest only what is wrong."""
+    for line in log:
+        text = COLOUR.sub("", line.decode(errors="replace")).rstrip()
+        if match := ADDRESS.search(text):
+            ports = [match["port"], *re.findall(r"localhost%3A(\d+)", match["address"])]
+            tunnel = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+            echo(f"open {match['address']} here, or elsewhere after 'ssh {tunnel} HOST'; Ctrl-C ends it")
+        elif not QUIET.search(text):
+            echo(text, err=True)
 
 
 def _send(file: BinaryIO, viewer: "subprocess.Popen[bytes]", newest: Callable[[], Path]) -> None:
