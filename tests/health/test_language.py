@@ -18,8 +18,8 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.cli.operation.live_table import LiveTable
 from otolith.health import text as module
-from otolith.health.limits import MACHINE, Level
-from otolith.health.observations import BUS, SENSORS
+from otolith.health.limits import Level
+from otolith.health.observations import BUS, DAEMON, SENSORS
 from otolith.health.schema import LANGUAGES, CountersDocument, Language, ReportDocument
 from otolith.health.text import announcements, event_text, headline, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
@@ -63,7 +63,7 @@ def test_files_and_languages_are_the_same() -> None:
 @pytest.mark.parametrize("language", OTHERS)
 def test_what_the_library_and_the_states_name_is_translated(language: Language) -> None:
     twins = [find_twin(name) for name in library_twins()]
-    words = {MACHINE, BUS, SENSORS} | {str(level) for level in Level} - {"OK"}
+    words = {BUS, SENSORS, DAEMON} | {str(level) for level in Level} - {"OK"}
     for twin in twins:
         words |= {parameter.meaning for parameter in twin.parameters} | {site.meaning for site in twin.sites}
         words |= {row.meaning for rows in (twin.inputs, twin.outputs, twin.states) for row in rows} | {twin.title}

@@ -5,8 +5,9 @@ import re
 import pytest
 
 from otolith.discovery.hypotheses import FaultType
-from otolith.health.limits import Level
+from otolith.health.limits import MACHINE, Level
 from otolith.health.schema import (
+    LANGUAGES,
     AlternativeDocument,
     DriverDocument,
     EventChange,
@@ -15,6 +16,7 @@ from otolith.health.schema import (
     FindingDocument,
     FindingKind,
     HealthDocument,
+    Language,
     ParameterDocument,
     PartDocument,
     Severity,
@@ -28,6 +30,7 @@ from otolith.health.text import (
     headline,
     moment_text,
     summary,
+    texts_in,
     undecided_text,
     value_cells,
     value_text,
@@ -135,6 +138,33 @@ def test_the_headline_does_not_repeat_events_that_have_lines_of_their_own() -> N
     assert EVENT.condition in headline(health)
     assert headline(health, events=(EVENT,)) == "ACT since t = 74 s"
     assert "worn" in headline(of_parts(Level.ACT, winding=EVENT.condition, shaft="worn"), events=(EVENT,))
+
+
+def unknown(names: str) -> PartDocument:
+    own = tuple(names.split(", "))
+    return PartDocument(state=Level.NO_DATA, since=0.0, reason=f"not determined yet: {names}", undetermined=own)
+
+
+def test_what_is_not_determined_is_said_once() -> None:
+    parts = {"winding": unknown("R_a"), "shaft": unknown("J"), "bearing": unknown("D, T_c")}
+    text = headline(HealthDocument(state=Level.NO_DATA, since=0.0, parts=parts, undetermined=("R_a",)))
+    assert text.endswith(": not determined yet: R_a, J, D, T_c")
+    assert text.count("determined") == 1
+
+
+def test_a_state_of_the_daemon_hides_no_missing_data() -> None:
+    failing = PartDocument(state=Level.WATCH, since=9.0, reason="the daemon cannot write")
+    health = HealthDocument(state=Level.WATCH, since=9.0, parts={"winding": unknown("R_a"), "daemon": failing})
+    assert_says(headline(health), "WATCH", "daemon: the daemon cannot write", "NO DATA", "winding", "R_a")
+    told = EVENT.model_copy(update={"state": Level.WATCH, "condition": failing.reason})
+    assert_says(headline(health, events=(told,)), "WATCH", "NO DATA", "winding", "R_a")
+    assert "NO DATA" not in headline(of_parts(Level.ACT, winding="worn"))
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_whole_machine_and_the_rest_of_it_have_different_names(language: Language) -> None:
+    texts = texts_in(language)
+    assert len({texts.part(""), texts.part(MACHINE), texts.part("winding"), texts.translated("parameter")}) == 4
 
 
 def test_while_undecided_there_is_one_line_without_formulas() -> None:

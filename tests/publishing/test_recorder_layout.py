@@ -71,7 +71,7 @@ def recorded(tmp_path: Path) -> tuple[Path, Path]:
 def test_lanes_change_with_the_state_and_begin_each_file(recorded: tuple[Path, Path]) -> None:
     lanes = [[state[0] for state in rows(path, "/state/winding", "StateChange:state")[1]] for path in recorded]
     assert lanes == [["OK", "WATCH", "ACT"], ["ACT", "OK"]]
-    begin = rows(recorded[1], "/state/machine", "StateChange:state")[0][0]
+    begin = rows(recorded[1], "/state/whole_machine", "StateChange:state")[0][0]
     assert begin == round((BEGIN + 15 * LENGTH) * 1e9)
     shown = [text[0].split("\n")[0] for text in rows(recorded[1], "/operator", "TextDocument:text")[1]]
     assert (shown[0], shown[-1]) == ("# ACT", "# OK")

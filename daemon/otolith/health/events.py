@@ -40,7 +40,7 @@ from otolith.health.schema import (
     Status,
     WindowDocument,
 )
-from otolith.health.text import PARTS, duration_text
+from otolith.health.text import PARTS, duration_text, reasons_of
 
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
@@ -448,10 +448,10 @@ def _states(
     levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
     is_known = any(parts[part].state is not Level.NO_DATA for part in plan.parts) or not plan.parts
     state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not no_data else Level.NO_DATA)
-    same = [item for item in parts.values() if item.state is state]
-    reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
-    since = min(item.since for item in same) if levels else _begin(before, report)
-    unknown = tuple(name for item in same for name in item.undetermined)
+    same = {name: item for name, item in parts.items() if item.state is state}
+    reason = PARTS.join(reasons_of(same))
+    since = min(item.since for item in same.values()) if levels else _begin(before, report)
+    unknown = tuple(name for item in same.values() for name in item.undetermined)
     whole = _kept(before, state, since, reason, unknown)
     return HealthDocument(**dict(whole), parts=parts, language=plan.language)
 

@@ -8,7 +8,7 @@ stays English.
 
 import re
 import tomllib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
@@ -16,6 +16,7 @@ from importlib.resources import files
 from otolith.acquisition.quality import time_text
 from otolith.discovery.decision import Approval
 from otolith.estimation.information import QUANTILE
+from otolith.health.limits import MACHINE, Level
 from otolith.health.schema import (
     ComponentDocument,
     CrossingDocument,
@@ -55,6 +56,10 @@ class Texts:
     def __call__(self, key: str, **values: object) -> str:
         """Return the text of ``key`` with its values."""
         return self.texts[key].format(**values)
+
+    def part(self, name: str) -> str:
+        """Return the name of a part for people; the whole machine without one."""
+        return self.texts["other_part"] if name == MACHINE else self.translated(name) or self.texts["whole_machine"]
 
     def translated(self, text: str) -> str:
         """Return an English text in this language; what no phrase matches stays English."""
@@ -146,7 +151,7 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text,
     With ``details`` also what to write into the machine file, as the specialist reads it.
     """
     texts = texts_in(event.language)
-    part, condition = texts.translated(event.part), event.condition
+    part, condition = texts.part(event.part), event.condition
     if event.change is EventChange.NOTED:
         return texts("noted", part=part, text=event.text, time=when(event.start))
     if event.end is not None:
@@ -209,22 +214,42 @@ def state_word(part: PartDocument) -> str:
 def headline(
     health: HealthDocument, when: Callable[[float], str] = moment_text, events: Collection[EventDocument] = ()
 ) -> str:
-    """State of the machine, since when, and which parts are in it and why.
+    """State of the machine, since when, and which parts are in it and why; also what is not known beside that.
 
-    Reasons that several parts share are given once, and none if lines of its own tell of each of the open ``events``.
+    Reasons that several parts share are given once. Those of ``events``, which have lines of their own, are left out.
     """
-    texts = texts_in(health.language)
+    texts, told = texts_in(health.language), {event.condition for event in events}
     state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
-    own = [name for name, part in health.parts.items() if part.state is health.state and part.reason]
-    parts: dict[str, list[str]] = {}
-    for name in own:
-        parts.setdefault(health.parts[name].reason, []).append(texts.translated(name))
-    if not parts or {event.condition for event in events} >= parts.keys():
-        return state
-    if len(parts) == 1 and len(own) == len(health.parts):
-        return f"{state}: {next(iter(parts))}"
-    why = (f"{', '.join(names)}: {reason}" for reason, names in parts.items())
-    return f"{state}: {'; '.join(why)}"
+    own = {name: part for name, part in health.parts.items() if part.state is health.state}
+    reasons = {reason: names for reason, names in reasons_of(own).items() if reason not in told}
+    if len(reasons) == 1 and len(next(iter(reasons.values()))) == len(health.parts):
+        return f"{state}: {next(iter(reasons))}"
+    why = [f"{', '.join(map(texts.part, names))}: {reason}" for reason, names in reasons.items()]
+    return "; ".join(filter(None, (": ".join(filter(None, (state, "; ".join(why)))), unknown_text(health, events))))
+
+
+def reasons_of(parts: Mapping[str, PartDocument]) -> dict[str, list[str]]:
+    """The reasons of the states of parts, and which parts have each.
+
+    Parameters that are not determined have one reason, of whichever parts they are.
+    """
+    found: dict[str, tuple[list[str], list[str]]] = {}
+    for name, part in parts.items():
+        names, parameters = found.setdefault(part.reason.removesuffix(", ".join(part.undetermined)), ([], []))
+        names.append(name)
+        parameters += part.undetermined
+    return {why + ", ".join(dict.fromkeys(own)): names for why, (names, own) in found.items() if why}
+
+
+def unknown_text(health: HealthDocument, events: Collection[EventDocument] = ()) -> str:
+    """Of which parts nothing is known, and why, while others are in a worse state; without reasons of ``events``."""
+    if health.state.rank <= Level.NO_DATA.rank:
+        return ""
+    texts, told = texts_in(health.language), {event.condition for event in events}
+    parts = {name: part for name, part in health.parts.items() if part.state is Level.NO_DATA}
+    rows = [(reason, names) for reason, names in reasons_of(parts).items() if reason not in told]
+    why = PARTS.join(f"{', '.join(map(texts.part, names))}: {reason}" for reason, names in rows)
+    return f"{texts.translated(Level.NO_DATA)}: {why}" if why else ""
 
 
 def undecided_text(document: ReportDocument, when: Callable[[float], str] = moment_text) -> str:
@@ -238,15 +263,15 @@ def undecided_text(document: ReportDocument, when: Callable[[float], str] = mome
     return texts("undecided", what=finding.condition, since=since, causes=causes)
 
 
-def brief(document: ReportDocument, when: Callable[[float], str] = moment_text, width: int = LINE) -> str:
-    """A report in one line of at most ``width`` characters: time, state, and the parameters that have room."""
+def brief(document: ReportDocument, when: Callable[[float], str] = moment_text) -> str:
+    """A report in one line of at most :data:`LINE` characters: time, state, and the parameters that have room."""
     state = "" if document.health is None else f" {state_word(document.health)}"
     line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
     texts = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
     for index, text in enumerate(texts):
         left = len(texts) - index - 1
         rest = f", and {left} more" if left else ""
-        if len(f"{line}, {text}{rest}") > width:
+        if len(f"{line}, {text}{rest}") > LINE:
             return f"{line}, and {left + 1} more"
         line += f", {text}"
     return line

@@ -147,7 +147,7 @@ def html_report(
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
     own_when = _time_of_day if is_of_calendar(axis.begin) else text.moment_text
-    own = {"when": own_when, "words": say.translated}
+    own = {"when": own_when, "words": say.translated, "part": say.part}
     environment.filters |= vars(text) | own | {"whole": whole, "quantity_text": quantity_text}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""

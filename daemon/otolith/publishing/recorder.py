@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rerun.blueprint.encodings import TimelineColumn
 
 from otolith.acquisition.window import Array, Verdict
-from otolith.health.limits import MACHINE, Level, MonitoredQuantity
+from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, Report, ReportDocument, Status
 from otolith.health.text import (
     Texts,
@@ -36,6 +36,7 @@ from otolith.health.text import (
     state_word,
     texts_in,
     undecided_text,
+    unknown_text,
     value_text,
 )
 from otolith.machine import RecordedMachine
@@ -278,9 +279,9 @@ class Recording:
                 continue  # the log of the engineer's tab has it
             self._rows[EVENTS].append((end, (event_text(event), "ERROR" if event.is_urgent else "WARN")))
         health = document.health
-        parts = {} if health is None else {MACHINE: health, **health.parts}
+        parts = {} if health is None else {"": health, **health.parts}
         for part, row in parts.items():
-            lane = "state/" + re.sub(r"\W+", "_", part)
+            lane = "state/" + re.sub(r"\W+", "_", self._source.plan.texts.part(part))
             if lane not in self._states:
                 names, colours = [str(level) for level in STATES], list(STATES.values())
                 labels = [texts_in(health.language).translated(name) for name in names] if health else names
@@ -404,6 +405,7 @@ def operator_text(document: ReportDocument) -> str:
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
         lines += [] if current else [_plain(health.reason or texts("all_well"))]
+    lines += [_plain(unknown)] if (unknown := unknown_text(health, current)) else []
     lines += [_plain(undecided)] if (undecided := undecided_text(document)) else []
     lines += [_paragraph(event, health.state) for event in current]
     judged = {event.id.partition("@")[0].partition("/")[2] for event in current}
@@ -418,7 +420,7 @@ def _paragraph(event: EventDocument, worst: Level) -> str:
     say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     state = "" if event.state is worst else f"{say.translated(event.state)}: "
-    what = _plain(f"{state}{say.translated(event.part)}: {event.condition}")
+    what = _plain(f"{state}{say.part(event.part)}: {event.condition}")
     what = f"## {what}\n{say('since', time=moment_text(event.since))}"
     advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
     return "  \n".join(filter(None, [what, advice, _plain(f"{event.text}{sure}")]))

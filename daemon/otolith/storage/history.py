@@ -118,9 +118,10 @@ def describe_machine(
     limits = {name: [(row.level, row.value, row.is_lower) for row in quantity.limits]
               for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
+    places = {row.name: row.meaning for row in twin.sites}
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
     texts |= {} if file is None else {"file": str(file.absolute())}
-    return json_text({**texts, "values": values, "limits": limits, "sites": sites})
+    return json_text({**texts, "values": values, "limits": limits, "sites": sites, "places": places})
 
 
 class _Description(BaseModel):
@@ -132,6 +133,7 @@ class _Description(BaseModel):
     values: dict[str, tuple[float | None, str, str]] = Field(default_factory=dict)
     limits: dict[str, tuple[tuple[Level, float, bool], ...]] = Field(default_factory=dict)
     sites: dict[str, tuple[str, str, str]] = Field(default_factory=dict)
+    places: dict[str, str] = Field(default_factory=dict)  # Meanings of the sites
     log: dict[str, tuple[str, ...]] | None = None
 
 

@@ -60,7 +60,7 @@ def event_table(changes: Iterable[EventDocument], width: int, newest: int | None
         worst = Text(words(row.worst), style=LEVEL_STYLES[row.worst] if not is_over else "")
         why = f"; {say('dropped', reason=event.reason)}" if event.reason else ""
         table.add_row(
-            begin, worst, words(event.part), f"{event.condition}{why}", Text(end, style="" if is_over else "bold")
+            begin, worst, say.part(event.part), f"{event.condition}{why}", Text(end, style="" if is_over else "bold")
         )
     return table
 

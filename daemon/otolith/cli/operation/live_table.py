@@ -196,7 +196,7 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
     texts, parts = texts_of(document), Text()
     say = texts.translated
     for name, part in health.parts.items():
-        parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
+        parts.append(f"{texts.part(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
     current = document.open_events
     is_in_headline = len(current) == 1  # several events have a line each instead
     own_lines = () if is_in_headline else current
@@ -205,7 +205,7 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
         lines.append(Text(undecided, style="bold magenta"))
     for event in current:
         if not is_in_headline or event.state is not health.state:
-            what, since = f"{say(event.state)}: {say(event.part)}: {event.condition}", local_time(event.since)
+            what, since = f"{say(event.state)}: {texts.part(event.part)}: {event.condition}", local_time(event.since)
             lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
         lines.append(Text(f"{event.text}{sure}"))
