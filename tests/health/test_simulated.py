@@ -88,7 +88,7 @@ def test_a_sensor_that_works_again_leaves_no_other_event() -> None:
     "fault",
     [
         Offset.model_validate({"kind": "offset", "signal": "ArmatureCurrent", "amount": "0.15 A", "start": "20 s"}),
-        Step.model_validate({"kind": "step", "parameter": "R_a", "amount": "2 ohm", "start": "20 s"}),
+        Step.model_validate({"kind": "step", "parameter": "R_a", "amount": "3.5 ohm", "start": "20 s"}),
     ],
     ids=lambda fault: fault.kind,
 )
@@ -101,7 +101,7 @@ def test_a_steady_speed_is_no_limit_of_its_sensor(fault: Offset | Step) -> None:
 
 
 def test_a_weaker_magnet_is_an_event_although_the_machine_file_gives_it_as_known() -> None:
-    step = Step.model_validate({"kind": "step", "parameter": "K_t", "start": "20 s", "amount": "-0.004 N*m/A"})
+    step = Step.model_validate({"kind": "step", "parameter": "K_t", "start": "20 s", "amount": "-0.011 N*m/A"})
     documents = reports(motor("demo").model_copy(update={"faults": (step,)}), 25)
     (event,) = [event for document in documents for event in announcements(document)]
     assert (event.part, event.state) == ("magnets", Level.ACT)

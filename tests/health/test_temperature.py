@@ -11,16 +11,17 @@ from otolith.acquisition.ring import MAX_OBSERVED_AGE, Rings
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.health.limits import Level
+from otolith.health.limits import Level, Limit, MonitoredQuantity
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.health.text import announcements
-from otolith.machine import LoadedMachine, load_machine
+from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
 from otolith.runtime.replay import Replay, open_recorded
 from otolith_drivers.base import Sample
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import Drift
 from otolith_drivers.plant.scenario import load_scenario, simulate
+from otolith_drivers.units import limit_values
 from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
 from tests.messages import raises_saying
 
@@ -28,6 +29,25 @@ COPPER, RISE, WINDOWS = 0.00393, 40.0, 60  # 1/K, K
 PERIOD, RECORDS = 0.01, 200
 ROW = 'R_a = { value = "6.5 ohm", estimate = true, watch = ["-2 %", "+5 %"], act = ["-5 %", "+10 %"]'
 MEASURED = ', temperature = "winding_temperature"'
+
+
+WARMER = {"R_": 105.0, "K_": 60.0, "psi": 80.0}  # K: of copper of thermal class F (IEC 60034-1), ferrite, neodymium
+
+
+@pytest.mark.parametrize("name", library_twins())
+def test_a_warm_healthy_machine_is_within_the_limits_of_its_twin(name: str) -> None:
+    """No temperature is measured, and the stated values are those of the cold machine."""
+    for parameter in find_twin(name).parameters:
+        rise = next((rise for begin, rise in WARMER.items() if parameter.name.startswith(begin)), 0.0)
+        assert bool(parameter.temperature_coefficient) == bool(rise), f"{parameter.name} depends on the temperature"
+        limits = [
+            Limit(level, value, value < parameter.nominal)
+            for level, texts in ((Level.WATCH, parameter.watch), (Level.ACT, parameter.act))
+            for value in limit_values(texts, parameter.unit, parameter.nominal)
+        ]
+        quantity = MonitoredQuantity(nominal=parameter.nominal, limits=tuple(limits))
+        warm = parameter.nominal * (1.0 + parameter.temperature_coefficient * rise)
+        assert quantity.level(warm, 0.0, Level.OK) == (Level.OK, None)
 
 
 def machine_with(own_machine: OwnMachine, extra: str, signals: str = "") -> LoadedMachine:
