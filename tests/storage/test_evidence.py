@@ -39,6 +39,7 @@ from otolith.storage.evidence import (
     Decoder,
     EvidenceWriter,
     encoded,
+    has_evidence,
     public_text,
     read_bundle,
 )
@@ -505,3 +506,20 @@ def test_a_small_bundle_is_little_work(folder: Path, kind: str) -> None:
     assert str(raised.value).startswith(f"{path}: ")
     assert {"files": "files", "values": "values", "depth": "values"}[kind] in str(raised.value)
     assert time.process_time() - begin < 2.0
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "expected"),
+    [
+        ("limit/R_a", EventChange.RAISED, True),
+        ("component/shaft/periodic", EventChange.CLEARED, True),
+        ("limit/R_a", EventChange.ACKNOWLEDGED, False),
+        ("limit/R_a", EventChange.UNSHELVED, False),
+        ("source/encoder", EventChange.RAISED, False),
+        ("data", EventChange.RAISED, False),
+        ("output/history", EventChange.CLEARED, False),
+    ],
+)
+def test_only_what_was_computed_has_evidence(key: str, change: EventChange, expected: bool) -> None:
+    changed = event(0, 1.0, change).model_copy(update={"id": f"{key}@1.0"})
+    assert has_evidence(changed) == expected

@@ -27,8 +27,9 @@ from otolith.estimation.imm_filter import UNKNOWN_AWAY, ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
 from otolith.machine import load_machine
+from otolith.storage.decisions import MAX_STATE_BYTES
 from otolith.storage.learned_state import LearnedState, learned_state, restored
-from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
+from otolith.storage.state_store import MAX_KEPT, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.conftest import EXAMPLES
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows

@@ -22,7 +22,6 @@ from otolith.adaptation.state import (
 from otolith.discovery.decision import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
-from otolith.storage import state_store
 from otolith.storage.state_store import LockedError, StateStore, StateWriter
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import writable
@@ -52,7 +51,7 @@ def store(tmp_path: Path) -> StateStore:
 
 @pytest.fixture
 def writer(store: StateStore) -> Iterator[StateWriter]:
-    thread = StateWriter(store, store.decisions_time())
+    thread = StateWriter(store, store.operator.time())
     thread.start()
     yield thread
     thread.stop(1.0)
@@ -84,7 +83,7 @@ def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: S
 
 def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> None:
     store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
-    writer = StateWriter(store, store.decisions_time())
+    writer = StateWriter(store, store.operator.time())
     writer.start()
     writer.save(STATE)
     wait_for(store.components_path.exists)
@@ -253,7 +252,7 @@ def test_who_finds_another_process_in_the_place_of_its_lock_writes_nothing(store
     store.lock()
     store.lock_path.unlink()
     with other_store(store).locked():
-        writer = StateWriter(store, store.decisions_time())
+        writer = StateWriter(store, store.operator.time())
         writer.start()
         writer.save(STATE)
         wait_for(lambda: writer.locked_out is not None)
@@ -373,7 +372,7 @@ def test_a_failed_write_leaves_the_file_as_it_was_and_nothing_else(
 def test_a_state_that_is_larger_than_what_is_read_is_not_written(
     store: StateStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state_store, "MAX_STATE_BYTES", 100)
+    monkeypatch.setattr("otolith.storage.decisions.MAX_STATE_BYTES", 100)
     with pytest.raises(ServiceError, match="larger than 100 bytes"):
         store.save(STATE)
 

@@ -15,6 +15,7 @@ from otolith.estimation.problem import Component, Problem, WindowOptions, augmen
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState
 from otolith.health.labels import TimeLabels
+from otolith.health.notes import OperatorNote
 from otolith.health.prognosis import Baseline, with_baselines
 from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus
@@ -142,14 +143,20 @@ class OperatorDecisions:
     """
     baselines: Mapping[str, Baseline] = field(default_factory=dict)
     """Of the parameters; relative limits refer to them."""
+    notes: tuple[OperatorNote, ...] = ()  # What persons did with events
 
-    def in_service_time(self, labels: TimeLabels) -> "OperatorDecisions":
-        """Return the decisions with ``forgotten`` on the clock of the windows; times of resets are only compared."""
-        return replace(self, forgotten={key: labels.last(time) for key, time in self.forgotten.items()})
+    def in_service_time(self, labels: TimeLabels, now: float) -> "OperatorDecisions":
+        """Return the decisions with ``forgotten`` and ``notes`` on the clock of the windows, which shows ``now``.
+
+        Times of resets are only compared. A note from the future is of a wrong clock: it was made now at the latest.
+        """
+        forgotten = {key: labels.last(time) for key, time in self.forgotten.items()}
+        notes = tuple(note.at_time(min(labels.last(note.at), now)) for note in self.notes)
+        return replace(self, forgotten=forgotten, notes=notes)
 
 
 def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
-    """Return the state after the operator's decisions, whose ``forgotten`` is on the clock of the windows."""
+    """Return the state after the operator's decisions, whose times are on the clock of the windows."""
     for name in sorted(decisions.resets):  # EVERYTHING comes first
         if state.resets.get(name) != decisions.resets[name]:
             state = _reset(state, name)
@@ -167,7 +174,8 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
     plan = with_baselines(state.plan, decisions.baselines)
     if plan.parameters != state.plan.parameters:  # the forecasts are about other limits
         state = replace(state, plan=plan, health=replace(state.health, forecasts={}))
-    return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets))
+    health = state.health.with_notes(decisions.notes)
+    return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets), health=health)
 
 
 def _reset(state: AdaptationState, name: str) -> AdaptationState:

@@ -34,6 +34,7 @@ from otolith.cli.common import (
     reader_options,
     shipped_directory,
 )
+from otolith.cli.operation.event import event
 from otolith.cli.operation.history import history, report, reproduce
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
@@ -362,6 +363,7 @@ COMMANDS: tuple[click.Command, ...] = (
     components,
     config,
     drivers,
+    event,
     history,
     init,
     install,

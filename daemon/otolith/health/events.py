@@ -14,6 +14,7 @@ from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity
+from otolith.health.notes import Deed, OperatorNote, Shelf, ended_events, lasting, noted, of_event, shelved_until
 from otolith.health.observations import (
     BUS,
     OUTPUT,
@@ -101,6 +102,9 @@ class HealthState:
     document: HealthDocument | None = None  # The states in the report before
     dropped: tuple[EventDocument, ...] = ()
     """Events that nothing is known of any more, each with its ``reason``; the next report clears them."""
+    notes: tuple[OperatorNote, ...] = ()  # Of persons, that the next report takes over
+    taken: tuple[str, ...] = ()  # Ids of the notes that were taken over, as far as they may be given again
+    shelves: Mapping[str, Shelf] = field(default_factory=dict)  # By the key of the condition
 
     @property
     def open_events(self) -> tuple[EventDocument, ...]:
@@ -117,13 +121,15 @@ class HealthState:
         """Return the state of a machine of which nothing was learned; events of what was learned are dropped."""
         own = {key: record for key, record in self.records.items() if key.startswith(OF_DATA)}
         lost = self.without_events(self.records.keys() - own.keys(), reason)
-        return HealthState(records=own, dropped=lost.dropped)
+        kept = {key: shelf for key, shelf in self.shelves.items() if key in own}
+        return HealthState(own, dropped=lost.dropped, notes=self.notes, taken=self.taken, shelves=kept)
 
     def without_events(self, keys: Collection[str], reason: str) -> "HealthState":
         """Return the state without these conditions; what was learned of them is dropped for the ``reason``."""
         records = {key: record for key, record in self.records.items() if key not in keys}
         events = [record.event for key, record in self.records.items() if key in keys and record.event is not None]
-        return replace(self, records=records).with_dropped(events, reason)
+        shelves = {key: shelf for key, shelf in self.shelves.items() if key not in keys}
+        return replace(self, records=records, shelves=shelves).with_dropped(events, reason)
 
     def without_hints(self, reason: str) -> "HealthState":
         """Return the state for another machine file, of which nothing is known to be wrong."""
@@ -146,6 +152,18 @@ class HealthState:
         dropped = tuple(event.model_copy(update={"reason": reason}) for event in events)
         return replace(self, dropped=self.dropped + dropped)
 
+    def with_notes(self, given: Sequence[OperatorNote]) -> "HealthState":
+        """Return the state with those of the ``given`` notes that it has not taken over yet; service times."""
+        new = tuple(note for note in given if note.id not in self.taken)
+        return replace(self, notes=self.notes + new, taken=tuple(note.id for note in given))
+
+
+def missed_notes(state: HealthState, notes: Iterable[OperatorNote]) -> list[str]:
+    """Return the ids of the events that ended before a note of a person about them came."""
+    known = {event.id for event in state.open_events}
+    new = (note for note in notes if note.id not in state.taken and note.ended is None)
+    return [note.event for note in new if note.event not in known and note.deed is not Deed.UNSHELVE]
+
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""
@@ -161,23 +179,30 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     state = _with_agreement(_with_doubts(replace(state, undetermined=undetermined), report), report)
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events, absent = {}, list[EventDocument](), set[str]()
+    shelves = lasting(state.shelves, state.notes, report.window.end)
     for key, observed in observations.items():
         own = observed if key in state.inside else _from_start(observed)
-        record = _advance(plan, state.records.get(key, ConditionRecord()), own, report)
-        if record.event is not None:
+        before = state.records.get(key, ConditionRecord())
+        record = _advance(plan, before, own, report)
+        if (event := record.event) is not None:
+            notes = of_event(state.notes, event.id)
+            event, shelf = noted(event, before.event, shelves.pop(key, None), notes, report.window.end)
+            record, shelves = replace(record, event=event), shelves if shelf is None else {**shelves, key: shelf}
             events.append(_published(plan, record, report))
             # Of windows that are estimated it is not true that nothing is known.
-            absent |= {record.event.id} if record.is_absent and record.event.state is Level.NO_DATA else set()
-            if record.event.end is not None:
+            absent |= {event.id} if record.is_absent and event.state is Level.NO_DATA else set()
+            if event.end is not None:
                 record = replace(record, event=None, cleared=report.window.index)
         if not record.is_over(report.window.index):
             records[key] = record
     events += [_ended(plan, event, report.window.start) for event in state.dropped]
+    events += ended_events(state.notes)
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
-    state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=())
+    state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=(), notes=())
+    state = replace(state, shelves=shelves)
     return state, report.model_copy(update={"health": document, "events": tuple(events)})
 
 
@@ -438,7 +463,9 @@ def _states(
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
         earlier = before.parts.get(part) if before else None
         if event := worst.get(part, no_data):
-            parts[part] = _kept(earlier, event.state, event.since, event.condition, ())
+            own = [item for item in events if item.part == event.part and item.state is event.state]
+            kept = _kept(earlier, event.state, event.since, event.condition, ())
+            parts[part] = kept.model_copy(update={"shelved": shelved_until(own)})
         elif missing := _undetermined(plan, part, report):
             key = "no_longer" if any(name in determined for name in missing) else "not_yet"
             reason = plan.texts(key, names=", ".join(missing))
@@ -453,7 +480,9 @@ def _states(
     since = min(item.since for item in same.values()) if levels else _begin(before, report)
     unknown = tuple(name for item in same.values() for name in item.undetermined)
     whole = _kept(before, state, since, reason, unknown)
-    return HealthDocument(**dict(whole), parts=parts, language=plan.language)
+    ends = [item.shelved for item in same if item.shelved is not None]
+    shelved = min(ends) if ends and len(ends) == len(same) else None
+    return HealthDocument(**{**dict(whole), "shelved": shelved}, parts=parts, language=plan.language)
 
 
 def _begin(before: PartDocument | None, report: ReportDocument) -> float:

@@ -82,7 +82,14 @@ class TimeLabels:
 
     def of_event(self, event: EventDocument) -> EventDocument:
         """Return an event with Unix times instead of service times."""
-        return _labelled(self, event, "start", "since", "end")
+        notes = {
+            name: _labelled(self, note, "at", "until")
+            for name in ("acknowledged", "shelved")
+            if (note := getattr(event, name)) is not None
+        }
+        if event.comments is not None:
+            notes["comments"] = tuple(_labelled(self, note, "at") for note in event.comments)
+        return _labelled(self, event, "start", "since", "end").model_copy(update=notes)
 
     def of_report(self, report: ReportDocument) -> ReportDocument:
         """Return a report with Unix times instead of service times."""
@@ -103,8 +110,8 @@ class TimeLabels:
         return report.model_copy(update=update)
 
     def _health(self, health: HealthDocument) -> HealthDocument:
-        parts = {name: _labelled(self, part, "since") for name, part in health.parts.items()}
-        return _labelled(self, health, "since").model_copy(update={"parts": parts})
+        parts = {name: _labelled(self, part, "since", "shelved") for name, part in health.parts.items()}
+        return _labelled(self, health, "since", "shelved").model_copy(update={"parts": parts})
 
     def _forecast(self, forecast: ForecastDocument) -> ForecastDocument:
         crossings = {

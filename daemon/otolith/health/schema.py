@@ -118,6 +118,23 @@ class EventChange(StrEnum):
     CHANGED = "changed"
     CLEARED = "cleared"
     NOTED = "noted"  # It happened at one moment, at which it also ends: the clock was set
+    ACKNOWLEDGED = "acknowledged"  # A person has seen it
+    SHELVED = "shelved"  # A person made it silent until a time
+    UNSHELVED = "unshelved"  # It is no longer silent: by a person, or as the time is over
+    COMMENTED = "commented"
+
+
+OF_PERSONS = frozenset({EventChange.ACKNOWLEDGED, EventChange.SHELVED, EventChange.COMMENTED})
+"""Changes that nobody has to be told of at once; the condition is as it was."""
+
+
+class NoteDocument(DocumentModel):
+    """What a person did with an event."""
+
+    by: str  # Name or account
+    at: float  # Unix seconds
+    text: str = ""  # Reason or comment
+    until: float | None = None  # Unix seconds, of a shelved event: when it is silent no more
 
 
 class EvidenceDocument(DocumentModel):
@@ -153,6 +170,14 @@ class EventDocument(DocumentModel):
     reason: str | None = None  # Why it is cleared although nothing shows that it is over: its learned state was dropped
     language: Language = "en"  # Of condition, text, cause, advice and reason
     evidence: EvidenceDocument
+    acknowledged: NoteDocument | None = None  # Who has seen it; None again once it is worse, or its diagnosis another
+    shelved: NoteDocument | None = None  # While it is silent
+    comments: tuple[NoteDocument, ...] | None = None  # The last ones
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nobody has to be told of its change at once: a hint, what is shelved, and what a person did."""
+        return self.is_hint or self.shelved is not None or self.change in OF_PERSONS
 
     @property
     def is_urgent(self) -> bool:
@@ -171,6 +196,7 @@ class PartDocument(DocumentModel):
     state: Level
     since: float  # Unix seconds
     reason: str = ""
+    shelved: float | None = None  # Unix seconds until which all events are silent that it is in this state for
     undetermined: tuple[str, ...] = ()  # The parameters because of which it is at NO DATA, although there are data
 
 

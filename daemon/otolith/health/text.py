@@ -26,6 +26,7 @@ from otolith.health.schema import (
     FindingKind,
     HealthDocument,
     Language,
+    NoteDocument,
     ParameterDocument,
     PartDocument,
     ReportDocument,
@@ -154,14 +155,29 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text,
     part, condition = texts.part(event.part), event.condition
     if event.change is EventChange.NOTED:
         return texts("noted", part=part, text=event.text, time=when(event.start))
+    notes = "".join(f"{PARTS}{note}" for note in note_texts(event, when))
     if event.end is not None:
         line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
-        return f"{line}; {texts('dropped', reason=event.reason)}" if event.reason else line
+        return f"{line}; {texts('dropped', reason=event.reason)}{notes}" if event.reason else f"{line}{notes}"
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     advice = "".join(f"; {text}" for text in (event.advice, event.setting if details else "") if text)
     state, since = texts.translated(event.state), when(event.since)
     values = {"state": state, "part": part, "condition": condition, "since": since, "text": event.text}
-    return texts("event", **values, sure=sure, advice=advice)
+    return f"{texts('event', **values, sure=sure, advice=advice)}{notes}"
+
+
+def note_texts(event: EventDocument, when: Callable[[float], str] = moment_text) -> list[str]:
+    """What persons did with an event, a sentence each: until when it is shelved, who has seen it, and comments."""
+    texts = texts_in(event.language)
+
+    def sentence(key: str, note: NoteDocument) -> str:
+        until = "" if note.until is None else when(note.until)
+        text = f": {note.text}" if note.text else ""
+        return texts(key, time=when(note.at), until=until, by=note.by, text=text)
+
+    notes = [("shelved", event.shelved), ("acknowledged", event.acknowledged)]
+    notes += [("comment", note) for note in event.comments or ()]
+    return [sentence(key, note) for key, note in notes if note is not None]
 
 
 def probability_text(event: EventDocument) -> str:
@@ -220,6 +236,7 @@ def headline(
     """
     texts, told = texts_in(health.language), {event.condition for event in events}
     state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
+    state += "" if health.shelved is None else f" ({texts('shelved_until', time=when(health.shelved))})"
     own = {name: part for name, part in health.parts.items() if part.state is health.state}
     reasons = {reason: names for reason, names in reasons_of(own).items() if reason not in told}
     if len(reasons) == 1 and len(next(iter(reasons.values()))) == len(health.parts):

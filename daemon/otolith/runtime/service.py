@@ -35,6 +35,7 @@ from otolith.adaptation.state import (
     with_sample_grid,
 )
 from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.events import missed_notes
 from otolith.health.labels import clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
@@ -186,7 +187,7 @@ class Service:
         self._rings = _rings(machine, max(plan.delay for plan in plans))
         self._windower = Windower(plans, machine.records, period, machine.limits)
         self._store = store_of(machine)
-        self._writer = StateWriter(self._store, self._store.decisions_time())
+        self._writer = StateWriter(self._store, self._store.operator.time())
         self._history = history_of(file)
         self._evidence = EvidenceWriter(machine)
         self._read_clocks, self._clock = clocks, ServiceClock(read=clocks)
@@ -317,7 +318,9 @@ class Service:
         return state
 
     def _decided(self, state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
-        return apply_decisions(state, decisions.in_service_time(self._clock.labels))
+        for event in missed_notes(state.health, decisions.notes):
+            log.warning("event %s is over: what a person did with it is not kept; a comment can be given again", event)
+        return apply_decisions(state, decisions.in_service_time(self._clock.labels, self._clock.now()))
 
     def _start_history(self) -> None:
         if self._history is not None:
@@ -459,14 +462,14 @@ class Service:
         )
 
     def _log(self, document: ReportDocument, now: float) -> None:
-        """Log the events that the window changed, and run the command for each; log the window once per hour.
+        """Log the events that the window changed, and run the command for those that are not silent.
 
-        Hints concern nobody whom the command calls. In a terminal each window is logged.
+        A window is logged once per hour, in a terminal each.
         """
         for event in announcements(document):
-            level = logging.ERROR if event.is_urgent else logging.INFO if event.is_hint else logging.WARNING
-            log.log(level, "%s", event_text(event, details=True))
-            if not event.is_hint:
+            level = logging.ERROR if event.is_urgent else logging.WARNING
+            log.log(logging.INFO if event.is_silent else level, "%s", event_text(event, details=True))
+            if not event.is_silent:
                 self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
@@ -516,6 +519,6 @@ def _rings(machine: LoadedMachine, delay: float) -> Rings:
 
 
 def _keys(state: AdaptationState) -> tuple[str, ...]:
-    """Return what is saved at once when it changes: the components, and the open events with their states."""
+    """Return what is saved at once when it changes: components, open events with their states, notes of persons."""
     events = (f"{event.id} {event.state}" for event in state.health.open_events)
-    return (*(known.component.key for known in state.adopted), *events)
+    return (*(known.component.key for known in state.adopted), *events, *state.health.taken, *state.health.shelves)

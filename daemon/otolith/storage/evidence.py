@@ -36,7 +36,8 @@ from pydantic import BaseModel
 from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
 from otolith.estimation.problem import Problem
-from otolith.health.schema import EventDocument, Report
+from otolith.health.events import OF_DATA
+from otolith.health.schema import EventChange, EventDocument, Report
 from otolith.health.text import announcements
 from otolith.machine import FINGERPRINT_KEYS, LIBRARY, LoadedMachine
 from otolith.storage.disk import WRITE_RETRY, WriterThread, reason_of, replace_file
@@ -53,12 +54,13 @@ from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
 
-VERSION = 5  # of the bundles: raised when a state has other fields
+VERSION = 6  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
 PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
 """Keys of tables of a machine file that bundles have; others may be secrets."""
+COMPUTED = frozenset({EventChange.RAISED, EventChange.CHANGED, EventChange.CLEARED})  # Changes that windows made
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 MAX_EVIDENCE_BYTES = 64 << 20  # of a bundle, packed and unpacked
 MAX_BUNDLES = 1000  # of a machine
@@ -282,6 +284,14 @@ def public_text(tables: Mapping[str, Any]) -> str:
     return "\n".join([*lines, ""])
 
 
+def has_evidence(event: EventDocument) -> bool:
+    """Whether windows and twin led to the change of an event, so that computing them again shows why.
+
+    What says that data or an output are missing is no result of them, and neither is what a person did.
+    """
+    return event.change in COMPUTED and not event.id.startswith(OF_DATA)
+
+
 def bundles_of(site: str, machine: str) -> dict[str, Path]:
     """Return the bundles of a machine in the state directory, by the time in their names: see :func:`stamp_of`."""
     named = ((NAME.fullmatch(path.name), path) for path in sorted((state_directory() / "evidence").glob("*.zip")))
@@ -319,7 +329,7 @@ class EvidenceWriter(WriterThread):
             self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
         state = None if before is self._after else before
         self._newer, self._after = (*self._newer, EvidenceWindow(state, window, report.document.to_json())), after
-        if events := tuple(announcements(report.document)):
+        if events := tuple(filter(has_evidence, announcements(report.document))):
             is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
             self.dropped += is_full
             bundle = Bundle(

@@ -10,57 +10,37 @@ import math
 import os
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
-
-from pydantic import Field
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
 from otolith.health.labels import TimeLabels
-from otolith.health.prognosis import Baseline, History
+from otolith.health.prognosis import History
 from otolith.machine import LoadedMachine
-from otolith.storage.disk import WriterThread, give_to, opened_folder, reason_of, replace_file
+from otolith.storage.decisions import REMEDY, DecisionsFile, read_model, write_model
+from otolith.storage.disk import WriterThread, give_to, opened_folder, reason_of
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
     SavedClock,
     check_components,
-    check_version,
     configuration_fingerprint,
     learned_state,
     restored,
     twin_fingerprint,
 )
 from otolith.twin.definition import Definition
-from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import state_directory, way_out
 
 log = logging.getLogger(__name__)
 
-DECISIONS_VERSION = 2
 KEPT = ".kept.json"
-REMEDY = "move the file away to start without it"
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
-MAX_STATE_BYTES = 8 * 1024 * 1024
 MAX_KEPT = 8  # files that were not used and are kept under another name
 PROCESS_ID_BYTES = 20
 DECISIONS_INTERVAL = 0.5  # s between two checks for decisions
-
-StateModel = TypeVar("StateModel", bound=StrictModel)
-
-
-class _DecisionsFile(StrictModel):
-    """The operator's decisions, written by the command line."""
-
-    version: int = DECISIONS_VERSION
-    approved: tuple[str, ...] = ()
-    rejected: tuple[str, ...] = ()
-    forgotten: dict[str, float] = Field(default_factory=dict)
-    resets: dict[str, float] = Field(default_factory=dict)
-    baselines: dict[str, Baseline] = Field(default_factory=dict)
 
 
 class LockedError(ServiceError):
@@ -77,11 +57,11 @@ class StateStore:
         self._site, self._machine, self._twin = site, machine, twin
         self._signal_fingerprint = signal_fingerprint
         folder = folder or state_directory() / "components"
-        self.components_path = folder / f"{site}.{machine}.json"
+        self.operator = DecisionsFile(folder, site, machine)
+        self.components_path, self.lock_path = self.operator.learned_path, self.operator.lock_path
+        self.decisions_path = self.operator.path
         self.earlier_path = folder / f"{site}.{machine}.earlier.json"
         """What was saved before, for when the newest file is damaged."""
-        self.decisions_path = folder / f"{site}.{machine}.decisions.json"
-        self.lock_path = folder / f"{site}.{machine}.lock"
         self._lock: int | None = None
         self._is_late = False  # Whether the lock could not be taken at the start
         self._is_blocked = False
@@ -185,19 +165,19 @@ class StateStore:
         """
         for path in (self.components_path, self.earlier_path):
             with contextlib.suppress(OtolithError):
-                learned = _read(path, LearnedState, VERSION)
+                learned = read_model(path, LearnedState, VERSION)
                 if learned is not None and not self._other_origin(learned):
                     return learned.clock, -math.inf if learned.filter is None else learned.filter.end
         return None, -math.inf
 
     def _learned(self) -> LearnedState | None:
         try:
-            learned = _read(self.components_path, LearnedState, VERSION)
+            learned = read_model(self.components_path, LearnedState, VERSION)
         except ConfigurationError as error:
             if not self.earlier_path.exists():
                 raise
             log.warning("%s; used is what was saved before it", error)
-            learned = _read(self.earlier_path, LearnedState, VERSION)
+            learned = read_model(self.earlier_path, LearnedState, VERSION)
         if learned is not None and (reason := self._other_origin(learned)):
             log.warning("%s: not used: %s", self.components_path, reason)
             return None
@@ -240,7 +220,7 @@ class StateStore:
     def _restored(self, state: AdaptationState) -> tuple[AdaptationState, str, bool]:
         """Return the state with what was saved, why not all of it is used, and whether the file is damaged."""
         try:
-            learned = _read(self.components_path, LearnedState, VERSION)
+            learned = read_model(self.components_path, LearnedState, VERSION)
             if learned is None:
                 return state, "", False
             if reason := self._other_origin(learned):
@@ -302,7 +282,7 @@ class StateStore:
         if self._is_blocked:
             raise ServiceError(f"{self.components_path}: not overwritten: it was refused and could not be renamed")
         with self.locked(), self._earlier_kept():
-            _write(self.components_path, learned, f"{self.components_path.name}.new")
+            write_model(self.components_path, learned, f"{self.components_path.name}.new")
 
     @contextlib.contextmanager
     def _earlier_kept(self) -> Iterator[None]:
@@ -322,30 +302,19 @@ class StateStore:
                 second.unlink()
 
     def decisions(self) -> OperatorDecisions:
-        """Return the operator's decisions; raise ConfigurationError if the file is unreadable or damaged."""
-        file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION) or _DecisionsFile()
-        return OperatorDecisions(
-            frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets, file.baselines
-        )
+        """Return the operator's decisions; raises as :meth:`DecisionsFile.read`."""
+        return self.operator.read()
 
     def save_decisions(self, decisions: OperatorDecisions) -> None:
-        """Write the decisions, which a running daemon applies with its next window; raise ServiceError if it cannot."""
-        keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
-        file = _DecisionsFile.model_validate({**asdict(decisions), **keys})
-        _write(self.decisions_path, file, f"{self.decisions_path.name}.{os.getpid()}.new")
-
-    def decisions_time(self) -> float:
-        """Return the Unix time of the latest decision, s; 0 if there is none."""
-        with contextlib.suppress(OSError):
-            return self.decisions_path.stat().st_mtime
-        return 0.0
+        """Write the decisions, whatever they were before; raises as :meth:`DecisionsFile.write`."""
+        self.operator.write(decisions)
 
 
 class StateWriter(WriterThread):
     """Keeps only the latest value in each direction."""
 
     def __init__(self, store: StateStore, decisions_time: float) -> None:
-        """``decisions_time`` is the :meth:`StateStore.decisions_time` of the decisions that are known already."""
+        """``decisions_time`` is the :meth:`DecisionsFile.time` of the decisions that are known already."""
         super().__init__("writer", DECISIONS_INTERVAL, "what was learned is not saved")
         self._store, self._decisions_time = store, decisions_time
         self._to_save: deque[AdaptationState] = deque(maxlen=1)
@@ -384,7 +353,7 @@ class StateWriter(WriterThread):
             self.locked_out = error
         except OtolithError as error:  # the next save fails as well, and is logged
             log.debug("%s", error)
-        decisions_time = self._store.decisions_time()
+        decisions_time = self._store.operator.time()
         if decisions_time == self._decisions_time:
             return
         self._decisions_time = decisions_time
@@ -398,24 +367,3 @@ def store_of(machine: LoadedMachine) -> StateStore:
     """Return the store of a machine."""
     names = machine.file.machine
     return StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
-
-
-def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None:
-    try:
-        if not path.exists():
-            return None
-        text = content(path, MAX_STATE_BYTES).decode()
-        check_version(text, newest)
-        return model.model_validate_json(text)
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ConfigurationError(f"{path}: {reason_of(error)}: {REMEDY}") from error
-
-
-def _write(path: Path, model: StrictModel, temporary: str) -> None:
-    """Replace a file as :func:`replace_file` does."""
-    data = (model.model_dump_json() + "\n").encode()
-    if len(data) > MAX_STATE_BYTES:
-        raise ServiceError(f"{path}: not written: larger than {MAX_STATE_BYTES} bytes")
-    replace_file(path, data, temporary)

@@ -14,7 +14,7 @@ from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
-from otolith.health.text import event_text, texts_in
+from otolith.health.text import PARTS, event_text, note_texts, texts_in
 
 DATE = len("2026-01-31 ")  # characters of a time before the time of day
 TIMES = DATE + len("23:59:59")
@@ -44,11 +44,11 @@ def event_table(changes: Iterable[EventDocument], width: int, newest: int | None
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold", width=min(width, MAX_WIDTH))
     length = TIMES if len(zones) < 2 else TIMES + max(map(len, zones))
     titles = [words("since"), say("state"), say("part"), say("cause"), say("is_cleared")]
-    since, state, part, cause, cleared = (f"{title[:1].upper()}{title[1:]}" for title in titles)
+    since, state, part, reason, cleared = (f"{title[:1].upper()}{title[1:]}" for title in titles)
     table.add_column(since, no_wrap=True, min_width=length)
     table.add_column(state, no_wrap=True)
     table.add_column(part, overflow="fold")
-    table.add_column(cause, overflow="fold", ratio=1)
+    table.add_column(reason, overflow="fold", ratio=1)
     table.add_column(cleared, width=NARROW_END if width < WIDTH_WITH_ENDS else None, overflow="fold")
     for row in rows:
         event, begin = row.event, local_time(row.event.start)[:length]
@@ -58,10 +58,9 @@ def event_table(changes: Iterable[EventDocument], width: int, newest: int | None
             end = local_time(event.end or 0.0)[:length]
             end = end[DATE:] if end[:DATE] == begin[:DATE] else end
         worst = Text(words(row.worst), style=LEVEL_STYLES[row.worst] if not is_over else "")
-        why = f"; {say('dropped', reason=event.reason)}" if event.reason else ""
-        table.add_row(
-            begin, worst, say.part(event.part), f"{event.condition}{why}", Text(end, style="" if is_over else "bold")
-        )
+        why = [say("dropped", reason=event.reason)] if event.reason else []
+        cause = PARTS.join([event.condition, *why, *note_texts(event, local_time)])
+        table.add_row(begin, worst, say.part(event.part), cause, Text(end, style="" if is_over else "bold"))
     return table
 
 

@@ -165,9 +165,13 @@ def _print_samples(samples: "Iterable[HistorySample]") -> None:
 
 
 def _print_events(events: "Iterable[EventDocument]") -> None:
+    from otolith.health.text import PARTS, note_texts
+
     columns = ("change", "part", "state", "condition", "cause", "text", "advice", "id", "reason")
-    echo_csv([("time", *columns)])
-    echo_csv([_utc(event.end or event.since), *(getattr(event, name) for name in columns)] for event in events)
+    echo_csv([("time", *columns, "notes")])
+    for event in events:
+        values = (getattr(event, name) for name in columns)
+        echo_csv([[_utc(event.end or event.since), *values, PARTS.join(note_texts(event, _utc))]])
 
 
 def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:

@@ -32,6 +32,7 @@ from otolith.health.text import (
     forecast_text,
     headline,
     interval_text,
+    note_texts,
     probability_text,
     state_word,
     texts_in,
@@ -209,6 +210,7 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
             lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
         lines.append(Text(f"{event.text}{sure}"))
+        lines += [Text(note, style="magenta") for note in note_texts(event, local_time)]
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
         lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
     hints = document.hints if details else ()
