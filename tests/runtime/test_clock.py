@@ -101,6 +101,13 @@ class Daemons:
     def warn_of_expiry(self, _: object) -> None:
         """Nothing expires."""
 
+    def warning(self, _: object) -> str:
+        """Nothing expires."""
+        return ""
+
+    def expiry_notice(self, _: object) -> None:
+        """Nothing expires."""
+
     def run(self, count: int = 1) -> None:
         """Monitor for ``count`` windows."""
         service = self.service

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith.cli.common import AS_JSON, local_time
-from otolith.cli.operation.history import SPANS, reader_of
+from otolith.cli.machines import reader_of
+from otolith.cli.operation.history import SPANS
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.outside_text import SURROGATE
 
