@@ -480,7 +480,7 @@ def _states(
     since = min(item.since for item in same.values()) if levels else _begin(before, report)
     unknown = tuple(name for item in same.values() for name in item.undetermined)
     whole = _kept(before, state, since, reason, unknown)
-    ends = [item.shelved for item in same if item.shelved is not None]
+    ends = [item.shelved for item in same.values() if item.shelved is not None]
     shelved = min(ends) if ends and len(ends) == len(same) else None
     return HealthDocument(**{**dict(whole), "shelved": shelved}, parts=parts, language=plan.language)
 
