@@ -9,6 +9,7 @@ from otolith.cli.console import Terminal
 from otolith.cli.operation.event_table import event_table
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
+from otolith.health.text import texts_in
 from tests.storage.histories import event
 
 BEGIN = 1_700_000_000.0  # Unix s, 2023-11-14 22:13:20 UTC
@@ -21,7 +22,7 @@ def change(key: str, of: EventChange, state: Level, start: float, **values: obje
 
 def lines(changes: list[EventDocument], width: int = 80, newest: int | None = None) -> list[str]:
     console = Terminal(file=io.StringIO(), width=width)
-    console.print(event_table(changes, width, newest))
+    console.print(event_table(changes, width, texts_in("en"), newest))
     written = console.file.getvalue()  # type: ignore[attr-defined]
     return [line.rstrip() for line in written.splitlines() if "2023-" in line or ":" in line]
 
@@ -78,6 +79,6 @@ def test_times_of_two_zones_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_it_is_in_the_language_of_the_machine() -> None:
     console = Terminal(file=io.StringIO(), width=80)
-    console.print(event_table([change("a", RAISED, Level.ACT, 0.0, language="de")], 80))
+    console.print(event_table([change("a", RAISED, Level.ACT, 0.0, language="de")], 80, texts_in("de")))
     written = console.file.getvalue()  # type: ignore[attr-defined]
     assert {"Seit", "Zustand", "Teil", "Ursache", "Behoben", "HANDELN", "nicht"} <= set(written.split())

@@ -1,9 +1,11 @@
 """Tables and styled lines of a terminal, in which no text from outside is an instruction to it."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.segment import Segment
 from rich.text import Text
 
@@ -33,3 +35,20 @@ def _escaped(renderable: RenderableType) -> RenderableType:
         return renderable
     same = {name: getattr(renderable, name) for name in ("style", "justify", "overflow", "no_wrap", "end")}
     return Text(visible(renderable.plain, SHOWN), **same)
+
+
+@dataclass(frozen=True, slots=True)
+class Localised:
+    """What is printed in a language whose numbers have another decimal sign; tables stay as wide as they were."""
+
+    shown: RenderableType
+    decimals: Callable[[str], str]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Return the segments with the decimal sign of the language."""
+        for segment in console.render(self.shown, options):
+            yield Segment(self.decimals(segment.text), segment.style, segment.control)
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        """Return the width of what is printed."""
+        return Measurement.get(console, options, self.shown)

@@ -40,6 +40,9 @@ ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
 PARTS = "; "
 LINE = 100  # characters that fit into a log beside its time; engineering choice
 MAX_SENTENCE = 500  # characters: the time of a match grows with a high power of them, and a device may write the text
+QUOTED = re.compile(r'("[^"\n]*"|`[^`\n]*`)')  # lines for a file, which has points in each language
+DECIMAL = re.compile(r"(?<![\w.,:/])(?<![\w.,:/][-+])(\d+)\.(\d+)(?!\d|[.:/])")
+"""A number with a decimal point. A date, an address and the number of a version have more points, or signs beside."""
 UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 """Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
 
@@ -61,6 +64,15 @@ class Texts:
     def part(self, name: str) -> str:
         """Return the name of a part for people; the whole machine without one."""
         return self.texts["other_part"] if name == MACHINE else self.translated(name) or self.texts["whole_machine"]
+
+    def decimals(self, text: str) -> str:
+        """Return a text in this language with the decimal sign of this language, but for what is in quotation marks."""
+        sign = self.texts["decimal_sign"]
+        if sign == "." or "." not in text:
+            return text
+        parts = QUOTED.split(text)
+        parts[::2] = (DECIMAL.sub(rf"\1{sign}\2", part) for part in parts[::2])
+        return "".join(parts)
 
     def translated(self, text: str) -> str:
         """Return an English text in this language; what no phrase matches stays English."""
@@ -151,6 +163,10 @@ def event_text(event: EventDocument, when: Callable[[float], str] = moment_text,
 
     With ``details`` also what to write into the machine file, as the specialist reads it.
     """
+    return texts_in(event.language).decimals(_event_sentence(event, when, details=details))
+
+
+def _event_sentence(event: EventDocument, when: Callable[[float], str], *, details: bool) -> str:
     texts = texts_in(event.language)
     part, condition = texts.part(event.part), event.condition
     if event.change is EventChange.NOTED:

@@ -45,8 +45,8 @@ STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 4
          604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
 WHOLE = re.compile(  # a date; a number with its interval and a short unit
     r"(\d{4}-\d\d-\d\d(?: [\d:.]+)?"
-    r"|\d[\d.]*(?:e-?\d+)? ± [\d.e-]+(?: [^\s\d.,;()±]{1,11})?"
-    r"|\d[\d.]*(?:e-?\d+)?(?: (?:%|°C|[pnµmkMG]?[ΩAVWN]\b|[nµm]?s\b))?)"
+    r"|\d[\d.,]*(?:e-?\d+)? ± \d[\d.,e-]*(?: [^\s\d.,;()±]{1,11})?"
+    r"|\d[\d.]*(?:,\d+)?(?:e-?\d+)?(?: (?:%|°C|[pnµmkMG]?[ΩAVWN]\b|[nµm]?s\b))?)"
 )
 UNBROKEN = Markup('<span class="whole">{}</span>')
 MAX_WHOLE = 26  # characters: a line of a phone in the type of a value; engineering choice
@@ -143,12 +143,17 @@ def html_report(
     curves.sort(key=lambda row: not urgent & {f"limit/{row.name}", f"component/{row.name.rpartition('/')[0]}"})
 
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: _shown(value, say),
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
     own_when = _time_of_day if is_of_calendar(axis.begin) else text.moment_text
     own = {"when": own_when, "words": say.translated, "part": say.part}
-    environment.filters |= vars(text) | own | {"whole": whole, "quantity_text": quantity_text}
+    own["whole"] = lambda written: whole(say.decimals(written))
+    environment.filters |= vars(text) | {"quantity_text": quantity_text} | own
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
     is_over = latest is not None and now <= latest.window.end
@@ -177,9 +182,10 @@ def whole(written: str) -> Markup:
     return Markup("").join(texts)
 
 
-def _shown(value: object) -> object:
+def _shown(value: object, texts: Texts) -> object:
     """Return what the template inserts with its controls escaped; the engine escapes the signs of HTML."""
-    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+    is_text = isinstance(value, str) and not isinstance(value, Markup)
+    return visible(texts.decimals(str(value))) if is_text else value
 
 
 def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
@@ -299,8 +305,8 @@ def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], cur
     def y(value: float) -> float:
         return round(min(max(50.0 * (top - value) / half, -1e4), 1e4), 2)  # a band may be far outside
 
-    def line(places: Iterable[tuple[float, float | None]]) -> str:
-        return " ".join(f"{axis.x(at)},{y(value or 0.0)}" for at, value in places)
+    def line(places: Iterable[tuple[float, float | None]]) -> Markup:  # numbers of SVG, which no language changes
+        return Markup(" ").join(f"{axis.x(at)},{y(value or 0.0)}" for at, value in places)
 
     band, lines = [], []
     for run in _runs(points, gaps):

@@ -375,7 +375,8 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     limits = sorted(quantity.limits, key=lambda row: abs(row.value - quantity.nominal))
     rows = [("nominal", quantity.nominal, LIMIT), *((str(row.level), row.value, STATES[row.level]) for row in limits)]
     say, unit = texts.translated, quantity.unit
-    return [(f"{say(name)} {quantity_text(value, unit, digits=4)}", value, colour) for name, value, colour in rows]
+    shown = [(f"{say(name)} {quantity_text(value, unit, digits=4)}", value, colour) for name, value, colour in rows]
+    return [(texts.decimals(text), value, colour) for text, value, colour in shown]
 
 
 def named_with_unit(name: str, unit: str) -> str:
@@ -412,7 +413,7 @@ def operator_text(document: ReportDocument) -> str:
     for name, item in document.parameters.items():
         if name not in judged and (expected := forecast_text(item, document.window.end, health.language)):
             lines.append(_plain(f"{name} {value_text(item)} {expected} (80 %)"))
-    return "\n\n".join(lines)
+    return texts.decimals("\n\n".join(lines))
 
 
 def _paragraph(event: EventDocument, worst: Level) -> str:
@@ -452,7 +453,7 @@ def report_text(document: ReportDocument) -> str:
             for row in document.components
         ]
     rows += [f"\n{_plain(event_text(event, details=True))}" for event in (*current, *document.hints)]
-    return "\n".join(rows)
+    return texts.decimals("\n".join(rows))
 
 
 def blueprint(source: RecordedMachine) -> rrb.Blueprint:

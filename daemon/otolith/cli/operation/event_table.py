@@ -14,7 +14,7 @@ from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
-from otolith.health.text import PARTS, event_text, note_texts, texts_in
+from otolith.health.text import PARTS, Texts, event_text, note_texts
 
 DATE = len("2026-01-31 ")  # characters of a time before the time of day
 TIMES = DATE + len("23:59:59")
@@ -31,14 +31,13 @@ class _EventRow:
     worst: Level
 
 
-def event_table(changes: Iterable[EventDocument], width: int, newest: int | None = None) -> Table:
+def event_table(changes: Iterable[EventDocument], width: int, say: Texts, newest: int | None = None) -> Table:
     """Return a table with begin, state, part, cause and end of each event of ``changes``, by their begin.
 
     The state is the most severe one that the event reached. With ``newest`` only so many rows. Times are local; those
     of another zone than the first name it.
     """
     rows = _rows(changes)[-(newest or 0) :]
-    say = texts_in(rows[-1].event.language if rows else "en")
     words = say.translated
     zones = {local_time(row.event.start)[TIMES:] for row in rows}
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold", width=min(width, MAX_WIDTH))
@@ -74,17 +73,20 @@ def _rows(changes: Iterable[EventDocument]) -> list[_EventRow]:
     return sorted(rows.values(), key=lambda row: row.event.start)
 
 
-def print_changes(console: Terminal, changes: Iterable[EventDocument], bundles: Mapping[int | None, Path]) -> None:
+def print_changes(
+    console: Terminal, changes: Iterable[EventDocument], bundles: Mapping[int | None, Path], say: Texts
+) -> None:
     """Print each change of an event as a paragraph, with the command that computes it again where there is evidence."""
     for event in changes:
-        change = "" if event.end is not None else f"{event.change}: "  # the text of a cleared event begins with it
+        # The text of a cleared event begins with it.
+        change = "" if event.end is not None else f"{say.translated(event.change or '')}: "
         console.print(f"{change}{event_text(event, local_time)}", style=event_style(event))
         if (bundle := bundles.get(event.sequence)) is not None:
             console.print(f"  otolith reproduce {shlex.quote(str(bundle))}", soft_wrap=True)
 
 
-def print_findings(console: Terminal, findings: Sequence[Mapping[str, Any]]) -> None:
+def print_findings(console: Terminal, findings: Sequence[Mapping[str, Any]], say: Texts) -> None:
     """Print each finding as a paragraph."""
     for finding in findings:
-        span = f"{local_time(finding['first'])} to {local_time(finding['last'])}"
-        console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows")
+        values = {"first": local_time(finding["first"]), "last": local_time(finding["last"]), "count": finding["count"]}
+        console.print(say.decimals(say("finding_of", text=say.translated(finding["text"]), **values)))

@@ -18,7 +18,10 @@ from otolith.cli.machines import reader_of
 from otolith.cli.terminal import echo, echo_csv, echo_json
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from otolith.health.schema import EventDocument
+    from otolith.health.text import Texts
     from otolith.storage.evidence import Bundle
     from otolith.storage.history import HistoryReader, HistorySample
 
@@ -224,31 +227,38 @@ def _print_table(
     details: bool,
     has_findings: bool,
 ) -> None:
-    from otolith.cli.console import Terminal
+    from otolith.cli.console import Localised, Terminal
     from otolith.cli.operation.event_table import event_table, print_changes, print_findings
-    from otolith_drivers.errors import counted
 
-    console = Terminal(highlight=True)
+    console, say = Terminal(highlight=True), _texts(reader)
     first = min((sample.time for sample in samples), default=since)
-    values = f", values per {interval}" if samples else ""
-    console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}{values}")
+    values = say("values_per", interval=say.translated(interval)) if samples else ""
+    begin = local_time(max(first, since))
+    console.print(say("history_of", machine=reader.machine, site=reader.site, time=begin, values=values))
     if samples:
-        console.print(_table(samples, console.width))
+        console.print(Localised(_table(samples, console.width, say), say.decimals))
     findings = reader.findings(since) if has_findings else []
     if details:
-        print_changes(console, events, _bundles(reader, since))
-        print_findings(console, findings)
+        print_changes(console, events, _bundles(reader, since), say)
+        print_findings(console, findings, say)
     else:
         newest = MAX_EVENTS if samples else None
         if events:
-            console.print(event_table(events, console.width, newest))
+            console.print(Localised(event_table(events, console.width, say, newest), say.decimals))
         earlier = len({event.id for event in events}) - (newest or math.inf)
         if earlier > 0:
-            console.print(f"{counted(int(earlier), 'earlier event')}: see --events")
+            console.print(say("earlier_events", count=int(earlier)))
         if findings:
-            console.print(f"{counted(len(findings), 'finding')}: see --details")
+            console.print(say("findings_counted", count=len(findings)))
     if not samples and not events:
         echo("no values or events since then", err=True)
+
+
+def _texts(reader: "HistoryReader") -> "Texts":
+    """Return the texts in the language of the machine, as its last report has it."""
+    from otolith.health.text import texts_in
+
+    return next((texts_in(report.health.language) for report in reader.latest(1) if report.health), texts_in("en"))
 
 
 def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
@@ -260,7 +270,7 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
     return {number: bundles[stamp] for number, stamp in stamps.items() if stamp in bundles}
 
 
-def _table(samples: "Sequence[HistorySample]", width: int) -> object:
+def _table(samples: "Sequence[HistorySample]", width: int, texts: "Texts") -> "RenderableType":
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
     from otolith_drivers.units import scale_of
@@ -268,7 +278,7 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
     length = max(width - OTHER_COLUMNS - RANGE_COLUMNS * has_range - words, MIN_CURVE)
-    table = parameter_table(*(("min", "max") if has_range else ()), "history", width=width)
+    table = parameter_table(*(("min", "max") if has_range else ()), "history", width=width, texts=texts)
     first, last = samples[0].time, samples[-1].time
     series: dict[tuple[str, str], list[HistorySample]] = {}
     for sample in samples:

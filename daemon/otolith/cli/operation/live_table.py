@@ -18,7 +18,7 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import drain, local_time
-from otolith.cli.console import Terminal
+from otolith.cli.console import Localised, Terminal
 from otolith.cli.machines import last_spoken
 from otolith.cli.terminal import echo
 from otolith.health.limits import Level
@@ -92,14 +92,15 @@ class _Machine:
         document, silence = self.document, time.monotonic() - self.received
         texts = texts_of(document)
         head = [title(document)] if in_short else []
+        parts = Localised(Group(*self._parts(width, in_short, details)), texts.decimals)
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
             silent = texts("silent", time=local_time(document.window.end), duration=duration_text(silence))
             return [
                 *head,
-                Text(f"{silent}: {state}", style="bold red"),
-                _Grey(Group(*self._parts(width, in_short, details))),
+                Text(f"{texts.decimals(silent)}: {state}", style="bold red"),
+                _Grey(parts),
             ]
-        return [*head, *self._parts(width, in_short, details)]
+        return [*head, parts]
 
     def _parts(self, width: int, in_short: bool, details: bool) -> list[RenderableType]:
         document, texts = self.document, texts_of(self.document)
