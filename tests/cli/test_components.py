@@ -19,7 +19,7 @@ from otolith.adaptation.state import (
     initial_state,
     restore_components,
 )
-from otolith.cli.commissioning import components as command
+from otolith.cli.commissioning import commission as command
 from otolith.cli.main import cli
 from otolith.estimation.problem import key_of
 from otolith.machine import load_machine
@@ -270,7 +270,7 @@ def test_commission_replays_with_the_levels_of_the_file_unless_they_explain_no_w
     times = 0.01 * np.arange(len(samples))[:, None]
     np.savetxt(data, np.hstack([times, samples]), delimiter=",", header="t," + ",".join(SIGNALS), comments="")
 
-    def counting(*arguments: Any) -> AdaptationState:
+    def counting(*arguments: Any) -> tuple[AdaptationState, dict[str, str]]:
         count[0] += 1
         return replayed(*arguments)
 

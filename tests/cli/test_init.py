@@ -62,7 +62,7 @@ def test_a_german_table_becomes_a_file_that_check_accepts(
     assert machine.problem.noise == pytest.approx(levels, rel=0.25)
     assert otolith("check", "--no-device", file).return_value == 0
     assert otolith("check", file, data).return_value == 0
-    assert text.splitlines()[-1] == f"next: otolith check '{file}' {data}"
+    assert f"next: otolith commission '{file}' {data} --write" in text.splitlines()
 
 
 def test_a_database_and_a_log_become_a_file_that_check_accepts(tmp_path: Path, scenario: MotorScenario) -> None:
@@ -149,7 +149,7 @@ def test_it_asks_for_each_answer_and_again_for_a_wrong_one(tmp_path: Path, scena
     data, file = german(tmp_path / "montag.csv", scenario, heading), tmp_path / "drive.toml"
     answers = ["dc_moter", "dc_motor", "", "", "friction", "", "", "Drehzahl", "V", "1/min", "", "1 s", "winch", ""]
     text = otolith("init", file, "--csv", data, "--ask", answers="\n".join(answers)).output
-    assert_says(text, "did you mean 'dc_motor'?", "next: otolith check")
+    assert_says(text, "did you mean 'dc_motor'?", "next: otolith commission")
     read = tables(file)
     assert read["signals"]["T_load"] == {"unknown": "friction"}
     assert read["signals"]["omega"] == {"column": "Drehzahl", "unit": "1/min"}

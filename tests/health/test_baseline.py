@@ -10,7 +10,7 @@ from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial
 from otolith.cli.main import cli
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import Level, Limit, MonitoredQuantity
-from otolith.health.prognosis import MIN_POINTS, Baseline, History, baselines, with_baseline, with_baselines
+from otolith.health.prognosis import MIN_POINTS, Baseline, History, find_baseline, with_baseline, with_baselines
 from otolith.health.schema import ForecastDocument
 from otolith.machine import load_machine
 from otolith.storage.state_store import StateStore
@@ -28,11 +28,40 @@ def history(value: float, count: int) -> History:
 
 
 def test_a_baseline_is_the_mean_of_enough_estimates() -> None:
-    known = baselines({"R_a": history(7.0, 200), "D": history(1.0, MIN_POINTS - 1)})
-    assert set(known) == {"R_a"}
-    assert known["R_a"].value == pytest.approx(7.0)
-    assert known["R_a"].sd == pytest.approx(0.01 * 2**0.5)  # not divided by the number: the errors are correlated
-    assert (known["R_a"].windows, known["R_a"].end) == (200, 398.0)
+    assert find_baseline(history(1.0, MIN_POINTS - 1), QUANTITY).baseline is None
+    known = find_baseline(history(7.0, 200), QUANTITY).baseline
+    assert known is not None
+    assert known.value == pytest.approx(7.0)
+    assert known.sd == pytest.approx(0.01 * 2**0.5)  # not divided by the number: the errors are correlated
+    assert (known.windows, known.end) == (200, 398.0)
+
+
+def test_estimates_from_windows_near_standstill_are_not_counted() -> None:
+    moving = history(7.0, 60)
+    still = tuple((200.0 + 2.0 * index, 7.0 + 3.0 * (-1) ** index, 4.0) for index in range(30))
+    found = find_baseline((*moving, *still), QUANTITY)
+    assert found.baseline is not None
+    assert found.baseline.value == pytest.approx(7.0, abs=1e-3)
+    assert found.baseline.sd < 0.02
+    assert (found.baseline.windows, found.vague) == (60, 30)
+    assert found.interval == pytest.approx(1.96 * 2.0, rel=1e-3)
+
+
+def test_a_baseline_with_an_interval_as_large_as_its_value_is_none() -> None:
+    """Of a friction of 0.020 ± 0.017 limits in percent would be those of chance."""
+    vague = tuple((2.0 * index, 0.02, (0.017 / 1.96) ** 2) for index in range(50))
+    found = find_baseline(vague, replace(QUANTITY, nominal=0.02))
+    assert found.baseline is None
+    assert "85%" in found.reason
+
+
+def test_a_baseline_wider_than_its_nearest_limit_is_kept_and_named() -> None:
+    wide = tuple((2.0 * index, 7.0, (0.5 / 1.96) ** 2) for index in range(50))
+    found = find_baseline(wide, QUANTITY)
+    assert found.baseline is not None
+    assert "7%" in found.reason
+    assert "5%" in found.reason
+    assert not find_baseline(history(7.0, 50), QUANTITY).reason
 
 
 def test_limits_in_percent_refer_to_the_baseline_and_others_stay() -> None:
@@ -76,7 +105,7 @@ def test_the_command_takes_the_saved_estimates(
     names = machine.file.machine
     store = StateStore(names.site, names.name, machine.twin)
     arguments = ["baseline", str(own_machine.machine)]
-    with pytest.raises(OtolithError, match="needs 20 estimates"):
+    with pytest.raises(OtolithError, match=r"R_a.*20 are needed"):
         CliRunner().invoke(cli, arguments, catch_exceptions=False, standalone_mode=False)
     state = initial_state(names.name, names.site, machine.problem, machine.plan)
     store.save(replace(state, health=HealthState(histories={"R_a": history(7.0, 50)})))
@@ -86,6 +115,9 @@ def test_the_command_takes_the_saved_estimates(
     assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
     store.save(replace(state, health=HealthState(histories={"R_a": history(5.9, 50)})))
     worn = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert "R_a: beyond its limit ACT below 6.175 Ω; if the machine is not healthy, undo it: --clear" in worn.output
+    assert (
+        "R_a: beyond its limit ACT below 6.175 Ω; if the machine is not healthy, undo it: otolith baseline --clear"
+        in worn.output
+    )
     CliRunner().invoke(cli, [*arguments, "--clear"], catch_exceptions=False)
     assert store.decisions().baselines == {}

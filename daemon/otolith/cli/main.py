@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith import __version__
-from otolith.cli.commissioning.components import baseline, commission, components, reset
+from otolith.cli.commissioning.commission import baseline, commission
+from otolith.cli.commissioning.components import components, reset
 from otolith.cli.commissioning.config import config
 from otolith.cli.commissioning.draft.command import init
 from otolith.cli.commissioning.drivers import drivers

@@ -42,6 +42,7 @@ class OwnValue:
     value: float  # In the unit of the twin
     sd: float | None = None  # None if it is not determined
     remark: str = ""  # Why it is not determined, or what it is taken from
+    is_taken: bool = False  # Whether it is taken from another parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +132,7 @@ class _Together:
     def joined(self, guesses: Sequence[Array]) -> Array:
         """Return the common guess of guesses of the windows, whose shared values are those of the first."""
         first = [
-            scale.inside(float(guesses[0][places[0]]))
-            for scale, places in zip(self.scales, self._places, strict=True)
+            scale.inside(float(guesses[0][places[0]])) for scale, places in zip(self.scales, self._places, strict=True)
         ]
         return np.concatenate([first, *(guess[self._own] for guess in guesses)])
 
@@ -181,7 +181,7 @@ class _Search:
             values, sd, weakest, cost, guesses = self._fitted(shared)
             if weakest is None:
                 break
-            self._hold(weakest)
+            self._hold(weakest, values, sd)
         loads = {
             name: (min(own), max(own))
             for name in self._loads & self._places.keys()
@@ -200,17 +200,22 @@ class _Search:
             shared[other].append(self._places[name])
         return shared
 
-    def _hold(self, weakest: Sequence[str]) -> None:
+    def _hold(self, weakest: Sequence[str], values: Mapping[str, float], sd: Mapping[str, float]) -> None:
         """Take one of the parameters that only together are determined as equal to another one, or as stated."""
         parameters = self._problem.free
         for name in weakest:
             mine = parameters[self._places[name]]
-            for other in self._places.keys() - self._loads - self._fixed.keys() - self._equal.keys() - set(weakest):
-                if _are_alike(mine, parameters[self._places[other]]):
+            for other in values.keys() - set(weakest):
+                is_determined = QUANTILE * sd[other] <= DETERMINED * abs(values[other])
+                if is_determined and _are_alike(mine, parameters[self._places[other]]):
                     self._equal[name] = other
                     return
         first, *others = weakest
-        self._fixed[first] = f"not determined beside {', '.join(others)}" if others else "the data do not show it"
+        remark = f"not determined beside {', '.join(others)}" if others else "the data do not show it"
+        self._fixed[first] = remark
+        for name in [name for name, other in self._equal.items() if other == first]:
+            del self._equal[name]
+            self._fixed[name] = remark
 
     def _fitted(
         self, shared: Mapping[str, Sequence[int]]
@@ -222,9 +227,7 @@ class _Search:
             free=tuple(row for row in self._problem.free if row.name not in self._fixed),
         )
         places = {row.name: at for at, row in enumerate(problem.free)}
-        moved = {
-            name: [places[self._problem.free[at].name] for at in ats] for name, ats in shared.items()
-        }
+        moved = {name: [places[self._problem.free[at].name] for at in ats] for name, ats in shared.items()}
         parameters = np.array([row.nominal for row in problem.free])
         guesses: list[Array] = []
         noise, walk = self._levels()
@@ -277,11 +280,10 @@ class _Search:
         walk = []
         for state, level in zip(twin.states, stated, strict=True):
             if state.name in outputs:
-                steps = [
-                    np.diff(window.column(state.name)[~window.missing_in(state.name)]) for window in self._windows
-                ]
-                level = float(np.sqrt(np.mean(np.concatenate(steps) ** 2) / period))
-            walk.append(level)
+                steps = [np.diff(window.column(state.name)[~window.missing_in(state.name)]) for window in self._windows]
+                walk.append(float(np.sqrt(np.mean(np.concatenate(steps) ** 2) / period)))
+            else:
+                walk.append(level)
         return np.array(noise), np.array(walk)
 
     def _whole(self, guess: Array, problem: Problem) -> Array:
@@ -299,7 +301,7 @@ class _Search:
                 continue
             if name in self._equal:
                 other = self._equal[name]
-                rows.append(OwnValue(name, values[other], None, f"taken as equal to {other}: the data show only both"))
+                rows.append(OwnValue(name, values[other], None, f"taken as equal to {other}", is_taken=True))
             elif name in self._fixed:
                 rows.append(OwnValue(name, self._nominal(name), None, self._fixed[name]))
             else:
@@ -321,7 +323,9 @@ def _deviations(
     The residuals are inflated by ``cost``. The one that the direction moves most comes first.
     """
     count = len(together.scales)
-    slopes = np.array([scale.slope(float(number)) for scale, number in zip(together.scales, result.guess, strict=False)])
+    slopes = np.array(
+        [scale.slope(float(number)) for scale, number in zip(together.scales, result.guess, strict=False)]
+    )
     sizes = np.array([_size(scale, value) for scale, value in zip(together.scales, values.values(), strict=True)])
     # Per share of a value, so that directions can be compared.
     jacobian = result.jacobian[:, :count] / slopes * sizes / max(cost, 1.0)

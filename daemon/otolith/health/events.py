@@ -342,23 +342,32 @@ def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str
     return judged
 
 
+def history_point(plan: MonitoringPlan, report: ReportDocument, name: str) -> tuple[float, float, float] | None:
+    """Return what a report adds to the history of a parameter: time (s), value and variance; None for nothing.
+
+    The value is that at the reference temperature.
+    """
+    item, quantity = report.parameters[name], plan.parameters.get(name)
+    is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
+    if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
+        return None
+    time, value, sd = report.window.end, item.value, item.sd
+    if report.decision is WindowDecision.LEARNED and item.raw is not None and item.raw_sd:
+        # Of this window alone, in its middle: its error is that of no other window, and lags behind no trend.
+        time, value, sd = 0.5 * (report.window.start + report.window.end), item.raw, item.raw_sd
+    referred = quantity.referred(value, sd, report.window.observed or {})
+    return None if referred is None else (time, referred[0], referred[1] ** 2)
+
+
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of this window in the histories, and with the forecasts that are due."""
     histories, forecasts = dict(state.histories), dict(state.forecasts)
-    for name, item in report.parameters.items():
-        quantity = plan.parameters.get(name)
-        is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
-        if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
+    for name in report.parameters:
+        if (point := history_point(plan, report, name)) is None:
             continue
-        time, value, sd = report.window.end, item.value, item.sd
-        if report.decision is WindowDecision.LEARNED and item.raw is not None and item.raw_sd:
-            # Of this window alone, in its middle: its error is that of no other window, and lags behind no trend.
-            time, value, sd = 0.5 * (report.window.start + report.window.end), item.raw, item.raw_sd
-        if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
-            continue
-        histories[name] = with_point(histories.get(name, ()), time, referred[0], referred[1] ** 2)
+        histories[name] = with_point(histories.get(name, ()), *point)
         if is_due(forecasts.get(name), histories[name]):
-            forecasts[name] = forecast(quantity, histories[name])
+            forecasts[name] = forecast(plan.parameters[name], histories[name])
     return replace(state, histories=histories, forecasts=forecasts)
 
 

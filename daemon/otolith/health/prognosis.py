@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.limits import MonitoredQuantity
 from otolith.health.schema import CrossingDocument, ForecastDocument
@@ -30,6 +31,8 @@ from otolith.health.schema import CrossingDocument, ForecastDocument
 MAX_POINTS = 200  # of a history
 REFIT = 0.02  # of the span of a history: how much longer it must be for another fit
 MIN_POINTS = 20  # of a history, for a forecast
+VAGUE, VAGUE_SHARE = 3.0, 0.1  # times the interval of most estimates, and share of the value, beyond which one is vague
+MAX_BASELINE_SHARE = 0.5  # of a baseline that its 95 % interval may have
 MIN_POINTS_AFTER = 10  # of a history after an onset
 MIN_TREND_PROBABILITY = 0.99  # of a trend, for a forecast
 MIN_CHANGE = 0.1  # of the distance to a limit that a trend must have covered, for a forecast
@@ -313,18 +316,47 @@ class Baseline:
     end: float  # Service time of the last of them, s
 
 
-def baselines(histories: Mapping[str, History]) -> dict[str, Baseline]:
-    """Return the baseline of each parameter with enough estimates.
+@dataclass(frozen=True, slots=True)
+class BaselineSearch:
+    """What the estimates of the healthy machine give for a parameter."""
 
-    Their errors are correlated, so the mean is as uncertain as one of them, and as much as they differ.
+    baseline: Baseline | None  # None with a reason
+    vague: int = 0  # Estimates that were not counted: their intervals are far wider than those of the others
+    interval: float = 0.0  # Half of the 95 % interval of the narrowest of them
+    reason: str = ""  # Why there is no baseline, or why it is not known well
+
+
+def find_baseline(history: History, quantity: MonitoredQuantity) -> BaselineSearch:
+    """Return the baseline that a history gives.
+
+    Errors of estimates are correlated, so the mean is as uncertain as one of them, and as much as they differ. Near
+    standstill a window hardly shows a parameter: estimates with a wide interval, which most others do not have, are not
+    counted. A baseline whose interval is as large as itself is none.
     """
-    known: dict[str, Baseline] = {}
-    for name, history in histories.items():
-        if len(history) >= MIN_POINTS:
-            _, values, variances = np.array(history).T
-            sd = math.sqrt(float(variances.mean() + values.var()))
-            known[name] = Baseline(float(values.mean()), sd, len(history), history[-1][0])
-    return known
+    if len(history) < MIN_POINTS:
+        return BaselineSearch(None, reason=f"{len(history)} estimates, {MIN_POINTS} are needed")
+    times, values, variances = np.array(history).T
+    half = QUANTILE * np.sqrt(variances)
+    vague = (half > VAGUE * np.quantile(half, 0.25)) & (half > VAGUE_SHARE * np.abs(np.median(values)))
+    left, narrowest = int(vague.sum()), float(half[vague].min(initial=math.inf))
+    times, values, variances = times[~vague], values[~vague], variances[~vague]
+    interval = narrowest if left else 0.0
+    if len(values) < MIN_POINTS:
+        few = f"{len(values)} estimates with a narrow interval, {MIN_POINTS} are needed"
+        return BaselineSearch(None, left, interval, few)
+    value, sd = float(values.mean()), math.sqrt(float(variances.mean() + values.var()))
+    if QUANTILE * sd >= MAX_BASELINE_SHARE * abs(value):
+        return BaselineSearch(None, left, interval, f"its interval is {_share(sd, value)} of the value")
+    known = Baseline(value, sd, len(values), float(times[-1]))
+    relative = [abs(limit.value / quantity.nominal - 1.0) for limit in quantity.limits if limit.is_relative]
+    reason = ""
+    if relative and QUANTILE * sd > min(relative) * abs(value):
+        reason = f"its interval is {_share(sd, value)} of the value, wider than its nearest limit ({min(relative):.0%})"
+    return BaselineSearch(known, left, interval, reason)
+
+
+def _share(sd: float, value: float) -> str:
+    return f"±{QUANTILE * sd / abs(value):.0%}" if value else "far more than 100 %"
 
 
 def with_baselines(plan: MonitoringPlan, known: Mapping[str, Baseline]) -> MonitoringPlan:

@@ -43,7 +43,11 @@ SEGMENT = "segment"  # optional column: a change of its text begins a new record
 SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
 HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name and unit
 # Other names of the column of the time, if none is 't'; its unit also stands behind an underscore.
-TIME_NAME = re.compile(r"(?:t|_?time|time[ _]?stamp|date[ _/]?time|zeit(?:stempel)?)(?:_(s|ms|us))?", re.IGNORECASE)
+TIME_NAME = re.compile(
+    r"(?:t|_?time|time[ _]?stamp|date[ _/]*(?:and )?time|(?:datum[ _/]*(?:und )?)?(?:uhr)?zeit(?:stempel)?)"
+    r"(?:_(s|ms|us))?",
+    re.IGNORECASE,
+)
 DATE = "2026-03-29T01:59:58.25Z"  # an example
 MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
 MIN_GROUPED = 10  # cells like 1.001, and whole numbers, from which on it is asked whether thousands are separated

@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
 from otolith.cli.terminal import echo, echo_json
+from otolith_drivers.grammars.toml_lines import toml_key, toml_value
 
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from otolith.commissioning.structure import Structure
     from otolith.machine import LoadedMachine
     from otolith.twin.definition import Input
+    from otolith_drivers.replay.readers import Reader
 
 
 @click.command()
@@ -38,12 +40,69 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     from otolith.machine import load_machine
 
     machine = load_machine(file, with_driver=False)
-    record = identified_record(machine, data, windows)
+    record = identified_record(machine, HealthyLog(data), windows)
     if as_json:
         echo_json(_document(machine, record), indent=2)
     else:
         lines = [*noise_lines(machine, record.noise), *structure_lines(machine, record.structure), ""]
         echo(*lines, *delay_lines(machine, record.delays))
+
+
+class HealthyData(Protocol):
+    """Data of the healthy machine, which may be read several times."""
+
+    @property
+    def path(self) -> Path:
+        """The file or folder that messages name."""
+
+    def opened(self, machine: "LoadedMachine") -> "Reader":
+        """Return a reader of the signals of ``machine``; raise ConfigurationError if there is nothing to read."""
+
+
+@dataclass(frozen=True, slots=True)
+class HealthyLog:
+    """A log."""
+
+    path: Path
+
+    def opened(self, machine: "LoadedMachine") -> "Reader":
+        """See :class:`HealthyData`."""
+        from otolith.runtime.replay import open_recorded
+
+        return open_recorded(machine, self.path)
+
+
+@dataclass(frozen=True, slots=True)
+class HealthySpan:
+    """What a daemon has recorded from ``begin`` to ``end`` (Unix s)."""
+
+    machine: "LoadedMachine"
+    begin: float
+    end: float
+
+    @property
+    def path(self) -> Path:
+        """The folder of the recordings."""
+        return self.machine.recording_folder
+
+    def opened(self, machine: "LoadedMachine") -> "Reader":
+        """See :class:`HealthyData`."""
+        from otolith.runtime.replay import open_recordings
+        from otolith.storage.recording_files import recording_file
+        from otolith_drivers.errors import ConfigurationError
+        from otolith_drivers.replay.span import SpanReader
+
+        names = machine.file.machine
+        known = [recording_file(path) for path in self.path.glob("*.rrd")]
+        own = [file for file in known if file is not None and file.key == f"{names.site}.{names.name}"]
+        files = [(file.begin, file.path) for file in own if file.begin <= self.end and file.end >= self.begin]
+        if not files:
+            newest = max((file.end for file in own), default=None)
+            until = "there is none of it" if newest is None else f"what is written ends at {local_time(newest)}"
+            remedy = "some minutes are written at a time, and [recording] says for how long they are kept"
+            span = f"from {local_time(self.begin)} to {local_time(self.end)}"
+            raise ConfigurationError(f"{self.path}: no recording of {names.name} {span}: {until}: {remedy}")
+        return SpanReader(open_recordings(machine, [path for _, path in sorted(files)]), self.begin, self.end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +129,7 @@ class HealthyRecord:
             return identify_noise(wider, self.windows, progress=show)
 
 
-def identified_record(machine: "LoadedMachine", data: Path, count: int) -> HealthyRecord:
+def identified_record(machine: "LoadedMachine", data: HealthyData, count: int) -> HealthyRecord:
     """Identify delays, noise and structure from ``count`` windows; raise ConfigurationError if none can be used."""
     from otolith.commissioning.delays import identify_delays_and_noise, without_delays
     from otolith.commissioning.identification import identify_noise
@@ -79,7 +138,7 @@ def identified_record(machine: "LoadedMachine", data: Path, count: int) -> Healt
 
     with progress_line("reading") as show:
         declared = {name: table.delay for name, table in machine.signal_tables.items()}
-        chosen = _good_windows(machine, data, count)
+        chosen = good_windows(machine, data, count)
         delays, identified = identify_delays_and_noise(machine.problem, chosen, declared, progress=show)
         problem, punctual = machine.problem, delays.applied(machine.problem, chosen)
         structure = remaining_structure(problem, identified, punctual, show)
@@ -93,47 +152,55 @@ def identified_record(machine: "LoadedMachine", data: Path, count: int) -> Healt
     if machine.problem.open_loop:
         echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:
-        raise ConfigurationError(f"{data}: {'; '.join(identified.remarks)}")
+        raise ConfigurationError(f"{data.path}: {'; '.join(identified.remarks)}")
     return record
 
 
-def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Window"]:
+def good_windows(machine: "LoadedMachine", data: HealthyData, count: int) -> list["Window"]:
     """At most ``count`` good windows, spread over the data; raise ConfigurationError, with why, if there is none."""
     from otolith.runtime.preview import EvenSpread
-    from otolith.runtime.replay import Replay, open_recorded
+    from otolith.runtime.replay import Replay
     from otolith_drivers.errors import ConfigurationError
 
     reasons: tuple[str, ...] = ()
     spread = EvenSpread["Window"](count)
-    with open_recorded(machine, data) as recorded:
+    with data.opened(machine) as recorded:
         run = Replay(machine, recorded)
         for window in run.windows():
             if window.quality.reasons:
                 reasons = window.quality.reasons
             else:
                 spread.add(window)
-        echo_warnings(data, run.warnings())
+        echo_warnings(data.path, run.warnings())
     if not (chosen := spread.chosen()):
         length = f"no window of {machine.file.window.length:g} s can be used"
-        raise ConfigurationError(f"{data}: {length}: {'; '.join(reasons) or 'the data is too short'}")
+        raise ConfigurationError(f"{data.path}: {length}: {'; '.join(reasons) or 'the data is too short'}")
     return chosen
+
+
+def level_rows(machine: "LoadedMachine", identified: "IdentifiedNoise") -> dict[str, list[tuple[str, str, str]]]:
+    """Return what belongs into the tables [noise] and [process_noise]: keys, values and remarks."""
+    twin = machine.twin
+    rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
+    inputs = zip(twin.inputs, identified.applied(machine.problem).levels, strict=False)
+    rows += [_input_row(machine, identified, source, level) for source, level in inputs if level]
+    states = [_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states]
+    return {"noise": rows, "process_noise": states}
 
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
     """The tables ``[noise]`` and ``[process_noise]``, with uncertainties and remarks as comments."""
     from otolith_drivers.errors import counted
 
-    twin, problem = machine.twin, machine.problem
+    tables = level_rows(machine, identified)
     yield "[noise]"
-    rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
-    inputs = list(zip(twin.inputs, identified.applied(problem).levels, strict=False))
-    rows += [_input_row(machine, identified, source, level) for source, level in inputs if level]
-    yield from _aligned(rows)
+    yield from _aligned(tables["noise"])
+    inputs = zip(machine.twin.inputs, identified.applied(machine.problem).levels, strict=False)
     measured = (source for source, level in inputs if not level and source.hold == "foh")
-    yield from (f"# {source.name}: {_input_row(machine, identified, source, 0.0)[1]}" for source in measured)
+    yield from (f"# {source.name}: {_input_row(machine, identified, source, 0.0)[2]}" for source in measured)
     yield ""
     yield "[process_noise]"
-    yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states])
+    yield from _aligned(tables["process_noise"])
     yield ""
     yield f"# identified from {counted(identified.windows, 'window')} of {machine.file.window.length:g} s"
     consistency = identified.consistency
@@ -148,20 +215,20 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
 
 def _input_row(
     machine: "LoadedMachine", identified: "IdentifiedNoise", source: "Input", level: float
-) -> tuple[str, str]:
-    """A line of the machine file for the noise of an input, and its comment: why it is not identified, if it is not."""
+) -> tuple[str, str, str]:
+    """Key and value of the noise of an input, and its comment: why it is not identified, if it is not."""
     from otolith.commissioning.identification import driven_states
 
-    line = f'{source.name} = "{level:.3g} {source.unit}"'
+    line = source.name, f"{level:.3g} {source.unit}"
     shown = next((row for row in identified.inputs if row.name == source.name), None)
     if shown is not None and shown.is_significant:
-        return line, f"± {shown.level_sd / shown.level:.1%}"
+        return *line, f"± {shown.level_sd / shown.level:.1%}"
     states = driven_states(machine.twin, source.name)
     contain = f"process noise of {' and '.join(states)}" if states else "noise of the outputs"
     acts = f"it cannot be told from {contain}: the level there includes it"
     if shown is None:
-        return line, f"not identifiable: {acts}"
-    return line, f"not significant: up to about {shown.limit:.1g} {source.unit} cannot be detected; {acts}"
+        return *line, f"not identifiable: {acts}"
+    return *line, f"not significant: up to about {shown.limit:.1g} {source.unit} cannot be detected; {acts}"
 
 
 def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
@@ -223,8 +290,8 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
     rows = []
     for late_signal in late:
         uncertainty = f"± {2e3 * late_signal.sd:.2g} ms" if late_signal.sd is not None else ""
-        line = f'{late_signal.name} = {{ delay = "{1e3 * late_signal.value:.4g} ms" }}'
-        rows.append((line, "; ".join(filter(None, [uncertainty, late_signal.remark]))))
+        value = {"delay": f"{1e3 * late_signal.value:.4g} ms"}
+        rows.append((late_signal.name, value, "; ".join(filter(None, [uncertainty, late_signal.remark]))))
     if late and machine.file.read_signals:
         yield "# under [signals], add the key delay to what is there:"
         yield from (f"# {line}" for line in _aligned(rows))
@@ -234,15 +301,16 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
     yield from (f"# {item.name}: {item.remark}" for item in delays.signals if item.remark and not item.is_late)
 
 
-def _row(level: "NoiseLevel", unit: str) -> tuple[str, str]:
-    """A line of the machine file, and its comment."""
+def _row(level: "NoiseLevel", unit: str) -> tuple[str, str, str]:
+    """A key of the machine file with its value, and its comment."""
     uncertainty = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
-    return f'{level.name} = "{level.value:.3g} {unit}"', "; ".join(filter(None, [uncertainty, level.remark]))
+    return level.name, f"{level.value:.3g} {unit}", "; ".join(filter(None, [uncertainty, level.remark]))
 
 
-def _aligned(rows: list[tuple[str, str]]) -> list[str]:
-    width = max(len(line) for line, _ in rows)
-    return [f"{line:{width}}  # {comment}" if comment else line for line, comment in rows]
+def _aligned(rows: Sequence[tuple[str, Any, str]]) -> list[str]:
+    lines = [f"{toml_key(name)} = {toml_value(value)}" for name, value, _ in rows]
+    width = max(map(len, lines), default=0)
+    return [f"{line:{width}}  # {row[-1]}" if row[-1] else line for line, row in zip(lines, rows, strict=True)]
 
 
 def _document(machine: "LoadedMachine", record: HealthyRecord) -> dict[str, Any]:

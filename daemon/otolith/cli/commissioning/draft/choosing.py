@@ -1,10 +1,8 @@
 """What ``otolith init`` proposes and asks, from a source to the file: units, twin, signals, window."""
 
-import os
 import re
 import shlex
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,9 +18,10 @@ from otolith.cli.commissioning.draft.writing import (
     proposed_noise,
     proposed_period,
 )
+from otolith.cli.commissioning.machine_lines import write_machine_file
 from otolith.cli.commissioning.probe_view import fitted_tables, stdout_console
 from otolith.cli.terminal import echo
-from otolith.machine import find_twin, library_twins, load_machine
+from otolith.machine import find_twin, library_twins
 from otolith.machine_file import check_name
 from otolith.runtime.preview import duration_text
 from otolith.twin.definition import Definition
@@ -80,11 +79,25 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
         period=float(period),
         length=float(window),
     )
-    _write_checked(file, machine_file_text(draft))
+    write_machine_file(file, machine_file_text(draft))
     echo("", f"written: {file}")
-    echo("[parameters] has the values of the twin's example: write those of your machine")
-    behind = f" {shlex.quote(source.check)}" if source.check else ""
-    echo(f"next: otolith check {shlex.quote(str(file))}{behind}")
+
+
+def next_lines(file: Path, source: OfferedSource, *, is_commissioned: bool) -> Iterator[str]:
+    """Yield what to do with a first machine file, whose values are those of the twin's example until commissioning."""
+    name, log = shlex.quote(str(file)), shlex.quote(source.check)
+    if not source.check:
+        yield "[parameters] has the values of the twin's example; what the daemon records shows those of your machine:"
+        yield f"next: otolith check {name}"
+        yield f"then: otolith run {name}, and after some minutes: otolith commission {name} --last 5m --write"
+        return
+    page = shlex.quote(f"{file.stem}.html")
+    if is_commissioned:
+        yield f"next: otolith replay {name} {log} --report {page}"
+        return
+    yield "[parameters] has the values of the twin's example; a log of the healthy machine shows its own:"
+    yield f"next: otolith commission {name} {log} --write"
+    yield f"then: otolith replay {name} {log} --report {page}"
 
 
 def with_units(offers: Sequence[Offer], units: Mapping[str, str]) -> list[Offer]:
@@ -219,20 +232,3 @@ def _number(text: str) -> float:
 
 def _seconds(text: str) -> str:
     return f"{Quantity('s', 1e-4, 600.0)(text):.9g} s"
-
-
-def _write_checked(file: Path, text: str) -> None:
-    """Write ``text`` into ``file`` if the daemon accepts it, at once and whole; else raise ConfigurationError."""
-    handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
-    made = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        try:
-            load_machine(made)
-        except ConfigurationError as error:
-            raise ConfigurationError(str(error).replace(str(made), str(file))) from error
-        made.chmod(0o644)
-        made.replace(file)
-    finally:
-        made.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from otolith.cli.common import FILE, StopSignal
 from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
+    from otolith.cli.commissioning.draft.choosing import Answers
     from otolith.cli.commissioning.draft.offers import OfferedSource
 
 OF_THE_SOURCE = ("units", "scales")  # options by the names of the source, which may be any text
@@ -66,7 +67,9 @@ def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) 
 @click.option("--window", help='Length of a window, as "2 s".  [default: 200 sample periods]')
 @click.option("--ask/--no-ask", default=None, help="Ask for each answer.  [default: if input is a terminal]")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
-def init(file: Path, ask: bool | None, force: bool, **options: Any) -> int:
+@click.option("--commission", "commissions", is_flag=True,
+              help="The log is of the healthy machine: also do 'otolith commission FILE LOG --write'.")  # fmt: skip
+def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options: Any) -> int:
     """Write a first machine file FILE from recorded data or a bus.
 
     It shows which signals there are and which of them move, proposes a twin and which signal is which of its inputs
@@ -76,13 +79,13 @@ def init(file: Path, ask: bool | None, force: bool, **options: Any) -> int:
     \b
     Examples:
       otolith init drive.toml --csv monday.csv
-      otolith init drive.toml --csv montag.csv --unit Drehzahl=1/min
+      otolith init drive.toml --csv montag.csv --unit Drehzahl=1/min --commission
       otolith init drive.toml --dbc drive.dbc --log monday.log
       otolith init drive.toml --dbc drive.dbc --channel can0
       otolith init drive.toml --modbus 192.168.0.10 --ask
       otolith init drive.toml --opcua opc.tcp://plc:4840 --driver user=otolith
     """
-    from otolith.cli.commissioning.draft.choosing import Answers, write_draft
+    from otolith.cli.commissioning.draft.choosing import Answers
     from otolith_drivers.errors import OtolithError
 
     if file.suffix != ".toml":
@@ -115,8 +118,23 @@ def init(file: Path, ask: bool | None, force: bool, **options: Any) -> int:
     if stop.received():
         return stop.code()
     stop.release()
-    write_draft(file, source, answers, questions)
+    _finish(file, source, answers, questions, commissions=commissions)
     return 0
+
+
+def _finish(
+    file: Path, source: "OfferedSource", answers: "Answers", questions: Questions, *, commissions: bool
+) -> None:
+    """Write the file, commission the machine by its log if that is wanted, and name the next command."""
+    from otolith.cli.commissioning.commission import WINDOWS, commission_log
+    from otolith.cli.commissioning.draft.choosing import next_lines, write_draft
+
+    if commissions and not source.check:
+        raise click.UsageError("--commission needs a log: --csv, or --dbc with --log")
+    write_draft(file, source, answers, questions)
+    if commissions:
+        commission_log(file, Path(source.check), WINDOWS, approve_all=not questions.asks, write=True)
+    echo(*next_lines(file, source, is_commissioned=commissions))
 
 
 def _source(kind: str, target: str, options: dict[str, Any], folder: Path, stop: StopSignal) -> "OfferedSource":

@@ -120,8 +120,8 @@ def _twin(draft: MachineDraft) -> Iterator[str]:
     yield "[twin]"
     yield f"name = {toml_value(draft.twin.name)}"
     yield ""
-    yield "## Values of the twin's example. Write those of your machine, from its data sheet, and remove the '#' before"
-    yield "## the line: the estimates are as right as the given values."
+    yield "## A line with '#' has the value of the twin's example. 'otolith commission --write' replaces it by that"
+    yield "## of your machine, from a healthy record. Or write that of a data sheet: estimates are as right as these."
     yield "[parameters]"
     for parameter in draft.twin.parameters:
         if parameter.role is not Role.SETTING:
@@ -138,8 +138,8 @@ def _parameter(parameter: Parameter) -> str:
 
 
 def _noise(draft: MachineDraft) -> Iterator[str]:
-    yield "## Standard deviation of the sensors, from the fastest changes of the values that came."
-    yield "## 'otolith noise' finds better ones in a record of the healthy machine."
+    yield "## Standard deviation of the sensors, at first from the fastest changes of the values that came;"
+    yield "## 'otolith commission --write' finds better ones in a healthy record."
     yield "[noise]"
     for name, level in draft.noise.items():
         yield f"{toml_key(name)} = {toml_value(level)}"

@@ -1,0 +1,512 @@
+"""``otolith commission`` and ``baseline``: what is normal for a machine, from a log of it or while its daemon runs."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from otolith.cli.commissioning.components import equation_of, key_of_record, loaded
+from otolith.cli.common import FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
+from otolith.cli.operation.history import Since, age_or_date
+from otolith.cli.terminal import echo
+
+if TYPE_CHECKING:
+    from otolith.adaptation.state import AdaptationState, ComponentRecord
+    from otolith.cli.commissioning.machine_lines import NewLine
+    from otolith.cli.commissioning.noise import HealthyData
+    from otolith.commissioning.delays import IdentifiedDelays
+    from otolith.commissioning.identification import IdentifiedNoise
+    from otolith.commissioning.own_values import OwnValues
+    from otolith.health.labels import TimeLabels
+    from otolith.health.prognosis import Baseline, History
+    from otolith.machine import LoadedMachine
+    from otolith.storage.history import HistoryReader
+    from otolith.storage.state_store import StateStore
+    from otolith.twin.definition import Parameter
+
+# Engineering choices, see docs/reference/thresholds-cli.md.
+WINDOWS = 30  # of which noise, delays and values are identified
+REACH = 4.0  # times a healthy value: bounds of its estimate
+LOAD_SHARE = 0.5  # of the bounds of an unknown load, beyond which the load of the record makes them wider
+REPORTS_AT_ONCE = 1000  # that are read from the history
+MORE_MOTION = "record more changes of speed and load, or set the baseline later by 'otolith baseline'"
+
+
+@click.command()
+@MACHINE_FILE
+@click.argument("data", type=FILE, required=False)
+@click.option("--last", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE",
+              help="Of the machine that runs: it was healthy for so long, like 2h.")  # fmt: skip
+@click.option("--since", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
+              help="The same, from here on.")  # fmt: skip
+@click.option("--until", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
+              help="The same, up to here.  [default: now]")  # fmt: skip
+@click.option("--yes", is_flag=True, help="Approve every component that is found.")
+@click.option("--write", is_flag=True, help="Write noise, delays and values that FILE does not state into FILE.")
+@click.option("--windows", type=click.IntRange(1, 1000), default=WINDOWS, help="At most so many windows for the noise.")
+def commission(
+    file: Path,
+    data: Path | None,
+    last: Since | None,
+    since: Since | None,
+    until: Since | None,
+    yes: bool,
+    write: bool,
+    windows: int,
+) -> None:
+    """Identify what is normal for the machine in FILE.
+
+    Searches data of the healthy machine for components that the twin lacks, and identifies noise levels and delays of
+    signals. You decide for each component whether it belongs to the machine; afterwards only a change is a finding.
+    Its estimates become the baseline of limits in percent.
+
+    The data are DATA, a log; stop the daemon before. Or they are what the daemon has recorded since a time: then it
+    goes on with all that it has learned, and takes over the baseline with its next window.
+
+    With --write and DATA, parameters that FILE does not state are identified first.
+
+    \b
+    Examples:
+      otolith commission my-machine.toml monday.csv --write
+      otolith commission my-machine.toml monday.csv --yes
+      otolith commission my-machine.toml --last 2h
+      otolith commission my-machine.toml --since 2026-01-31T06:00 --until 2026-01-31T08:00
+    """
+    spans = [name for name, given in (("--last", last), ("--since", since), ("--until", until)) if given]
+    if data is not None and spans:
+        raise click.UsageError(f"{spans[0]} is of a machine that runs, not of DATA: give one of them")
+    if data is None and not (last or since):
+        raise click.UsageError("which data are of the healthy machine? give DATA, or --last 2h of a machine that runs")
+    if last and since:
+        raise click.UsageError("--last and --since both say where it begins: give one of them")
+    if data is not None:
+        commission_log(file, data, windows, approve_all=yes, write=write)
+        return
+    end = until.before(time.time()) if until else time.time()
+    begin = (last or since or Since()).before(end if last else time.time())
+    if begin >= end:
+        raise click.UsageError(f"it begins at {local_time(begin)}, but ends at {local_time(end)}")
+    machine, store = loaded(file)
+    _commission_running(machine, store, (begin, end), windows, approve_all=yes, write=write)
+
+
+def commission_log(file: Path, data: Path, windows: int, *, approve_all: bool, write: bool) -> None:
+    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``."""
+    from otolith.cli.commissioning.noise import HealthyLog
+
+    machine, store = loaded(file)
+    with store.locked():
+        if write:
+            machine = _with_own_values(machine, HealthyLog(data), windows)
+        _commission(machine, store, HealthyLog(data), windows, approve_all=approve_all, write=write)
+
+
+def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int) -> "LoadedMachine":
+    """Return the machine with the values that its file does not state, as the data show them; they are written."""
+    from otolith.cli.commissioning.machine_lines import with_keys
+    from otolith.cli.commissioning.noise import good_windows
+    from otolith.commissioning.own_values import own_values
+    from otolith.twin.definition import Role
+    from otolith.twin.unmeasured import Assumption
+    from otolith_drivers.errors import ConfigurationError, counted
+
+    stated = {name for name, table in machine.file.parameters.items() if table.value is not None}
+    rows = [row for row in machine.twin.parameters if row.name not in stated and row.role is not Role.SETTING]
+    loads = {item.name for item in machine.unmeasured if item.assumption is Assumption.CONSTANT}
+    free = [row for row in rows if row.part or row.role is Role.ESTIMATED]
+    if not {row.name for row in free} - loads:
+        return machine
+    with progress_line("reading") as show:
+        chosen = good_windows(machine, data, windows)
+        found = own_values(machine.problem, chosen, free, loads, show)
+    if not found.is_followed:
+        left = f"it leaves {found.cost:.3g} times the noise" if math.isfinite(found.cost) else "no value is determined"
+        remedy = "check units and signs in [signals]; 'otolith twin list' shows other twins"
+        raise ConfigurationError(
+            f"{data.path}: twin {machine.twin.name!r} does not describe the machine: {left}: {remedy}"
+        )
+    lines, remarks = _value_lines(machine, found, data.path)
+    echo(*remarks, err=True)
+    rest = [f"{row.name} = {row.nominal:.4g} {row.unit} ({row.meaning})" for row in rows if row not in free]
+    if rest:
+        echo(f"of the design, as in the twin's example: {', '.join(rest)}: write what your machine has", err=True)
+    echo(f"{machine.path}: {counted(len(lines), 'value')} written into [parameters]", err=True)
+    return _written(machine, lambda text: with_keys(text, "parameters", lines))
+
+
+def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "tuple[dict[str, NewLine], list[str]]":
+    """Return the lines of [parameters] for what was found, and what people must know of it."""
+    from otolith.cli.commissioning.machine_lines import NewLine
+    from otolith.estimation.information import QUANTILE
+    from otolith.health.text import interval_text
+    from otolith.twin.definition import Role
+
+    lines, remarks = dict[str, NewLine](), list[str]()
+    for item in found.values:
+        row = machine.twin.parameter(item.name)
+        if item.sd is None and not item.is_taken:
+            stays = f"it stays {row.nominal:.4g} {row.unit} of the twin's example: write that of the data sheet"
+            remarks.append(f"{row.name} ({row.meaning}): {item.remark}; {stays}")
+            continue
+        if item.sd is None:
+            remark = item.remark
+            remarks.append(f"{row.name} = {item.value:.4g} {row.unit}, {item.remark}")
+        else:
+            remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, from {data.name}"
+            remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({row.meaning})")
+        value: dict[str, object] | str = f"{item.value:.5g} {row.unit}"
+        if row.role is Role.ESTIMATED:
+            low, high = _bounds(row, item.value)
+            value = {"value": value, "estimate": True, "low": f"{low:.4g} {row.unit}", "high": f"{high:.4g} {row.unit}"}
+        lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
+    for name, (low, high) in found.loads.items():
+        row, largest = machine.twin.parameter(name), max(abs(low), abs(high))
+        if largest > LOAD_SHARE * max(abs(row.low), abs(row.high)):
+            ends = (0.0 if row.low >= 0.0 else -REACH * largest, 0.0 if row.high <= 0.0 else REACH * largest)
+            bounds = {key: f"{end:.3g} {row.unit}" for key, end in zip(("low", "high"), ends, strict=True)}
+            value = {"value": f"{0.5 * (low + high):.3g} {row.unit}", "estimate": True, **bounds}
+            lines[name] = NewLine(value, row.meaning)
+    return lines, remarks
+
+
+def _bounds(row: "Parameter", value: float) -> tuple[float, float]:
+    """Return bounds for an estimate of a healthy ``value``; below zero only where the twin allows it."""
+    if row.low > 0.0:
+        return value / REACH, REACH * value
+    reach = REACH * max(abs(value), LOAD_SHARE * abs(row.nominal))
+    return (0.0 if row.low == 0.0 else -reach), reach
+
+
+def _with_noise_and_delays(
+    machine: "LoadedMachine", identified: "IdentifiedNoise", delays: "IdentifiedDelays"
+) -> "LoadedMachine":
+    """Return the machine with noise levels and delays, which are written into its file."""
+    from otolith.cli.commissioning.machine_lines import NewLine, with_delay, with_keys
+    from otolith.cli.commissioning.noise import level_rows
+    from otolith_drivers.errors import counted
+
+    tables = {name: {key: NewLine(value, remark) for key, value, remark in rows}
+              for name, rows in level_rows(machine, identified).items()}  # fmt: skip
+    late = [item for item in delays.signals if item.is_late and item.sd is not None]
+
+    def changed(text: str) -> str:
+        for table, lines in tables.items():
+            text = with_keys(text, table, lines)
+        for item in late:
+            remark = f"± {2e3 * (item.sd or 0.0):.2g} ms"
+            text = with_delay(text, item.name, f"{1e3 * item.value:.4g} ms", remark)
+        return text
+
+    written = _written(machine, changed)
+    done = [f"{counted(len(lines), 'level')} in [{table}]" for table, lines in tables.items() if lines]
+    echo(f"{machine.path}: written: {', '.join(done)}", err=True)
+    for item in late:
+        said = f'{item.name} is {1e3 * item.value:.3g} ms late: written: delay = "{1e3 * item.value:.4g} ms"'
+        echo(f"{machine.path}: {said} under [signals]", err=True)
+    return written
+
+
+def _written(machine: "LoadedMachine", change: Callable[[str], str]) -> "LoadedMachine":
+    """Return the machine after a change of its file; raise ConfigurationError if the file cannot be changed so."""
+    from otolith.cli.commissioning.machine_lines import Unchangeable, write_machine_file
+    from otolith.machine import load_machine
+    from otolith_drivers.errors import ConfigurationError
+
+    try:
+        text = change(machine.path.read_text(encoding="utf-8"))
+    except Unchangeable as error:
+        remedy = "change it by hand: without --write the lines are printed"
+        raise ConfigurationError(f"{machine.path}: {error}: {remedy}") from error
+    write_machine_file(machine.path, text)
+    return load_machine(machine.path, with_driver=False)
+
+
+def _commission(
+    machine: "LoadedMachine",
+    store: "StateStore",
+    data: "HealthyData",
+    windows: int,
+    *,
+    approve_all: bool,
+    write: bool,
+) -> None:
+    from otolith.adaptation.state import ComponentRecord
+    from otolith.cli.commissioning.noise import delay_lines, identified_record, noise_lines
+    from otolith.commissioning.identification import explains_no_window
+    from otolith_drivers.errors import OtolithError
+
+    record = identified_record(machine, data, windows)
+    identified = record.noise_beside(machine) if record.offered else record.noise
+    components = tuple(ComponentRecord.of(item) for item in record.offered)
+    if write:
+        machine = _with_noise_and_delays(machine, identified, record.delays)
+        state, advice = _replayed(machine, data, components)
+    else:
+        is_useless = bool(components) or explains_no_window(machine.problem, record.noise, record.windows[0])
+        first = None if is_useless else _replayed(machine, data)
+        echo(*noise_lines(machine, identified), *delay_lines(machine, record.delays))
+        if first is not None and first[0].adopted:  # the file's noise levels may have hidden a component
+            state, advice = first
+        else:
+            state, advice = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
+        if record.offered:
+            echo("# this process noise is right with the components below: if you approve them, put it into the file")
+        elif state.adopted:
+            echo("# this process noise contains the components below: keep that of the file if you approve them")
+        else:
+            echo("# put these tables into the machine file in place of its own, or let --write do it", err=True)
+    _review(machine, store, state, components, approve_all=approve_all)
+    try:
+        keep_baseline(machine, store, state.health.histories, advice)
+    except OtolithError as error:  # nothing that has limits, or a record that is too short
+        echo(*str(error).split("\n"), err=True)
+
+
+def _replayed(
+    machine: "LoadedMachine", data: "HealthyData", components: "tuple[ComponentRecord, ...]" = ()
+) -> "tuple[AdaptationState, dict[str, str]]":
+    """Return the state after all windows of the data, and for each parameter what would determine it.
+
+    The ``components`` are in the twin from the first window on.
+
+    Findings and warnings are printed to standard error.
+    """
+    from otolith.adaptation.state import restore_components
+    from otolith.runtime.replay import Replay
+
+    advice: dict[str, str] = {}
+    with data.opened(machine) as recorded, progress_line("replay") as show:
+        run = Replay(machine, recorded)
+        run.state = restore_components(run.state, components)
+        for report in run.reports():
+            document = report.document
+            show(f"window {document.window.index}, {run.progress:.0%} of the data")
+            for finding in document.findings:
+                echo(f"window {document.window.index}: {finding.text}", err=True)
+            advice |= {name: item.advice for name, item in document.parameters.items() if item.advice}
+        echo_warnings(data.path, run.warnings())
+        return run.state, advice
+
+
+def _review(
+    machine: "LoadedMachine",
+    store: "StateStore",
+    state: "AdaptationState",
+    pooled: "tuple[ComponentRecord, ...]",
+    *,
+    approve_all: bool,
+) -> None:
+    """Ask for a decision on each component, keep the approved ones, and print the estimated parameters.
+
+    The values of ``pooled`` components are kept: all windows together are more precise than the filter after them.
+    """
+    from otolith.adaptation.state import component_records
+    from otolith.health.text import interval_text
+
+    precise = {key_of_record(record): record for record in pooled}
+    records = tuple(precise.get(key_of_record(record), record) for record in component_records(state))
+    approved, rejected = _asked(machine, records, approve_all=approve_all)
+    if store.components_path.exists():
+        echo(f"what was learned before is kept as {store.set_aside()}", err=True)
+    store.save_components(tuple(record for record in records if key_of_record(record) in approved))
+    _decide(store, approved, rejected)
+    if not records:
+        echo("no component was found: the twin explains the machine up to the noise", err=True)
+    posterior = state.posterior.prior()
+    for index, parameter in enumerate(state.problem.free):
+        if not parameter.name.startswith("_"):
+            mean, variance = float(posterior.mean[index]), float(posterior.covariance[index, index])
+            echo(f"{parameter.name} = {interval_text(mean, variance**0.5, parameter.unit)}", err=True)
+
+
+def _asked(
+    machine: "LoadedMachine", records: "Sequence[ComponentRecord]", *, approve_all: bool
+) -> tuple[set[str], set[str]]:
+    """Return the keys of the components that belong to the healthy machine, and of those that do not."""
+    approved, rejected = set[str](), set[str]()
+    for record in records:
+        echo(f"found {key_of_record(record)}: {equation_of(machine, record)}", err=True)
+        (approved if approve_all or _is_healthy() else rejected).add(key_of_record(record))
+    return approved, rejected
+
+
+def _decide(store: "StateStore", approved: set[str], rejected: set[str]) -> None:
+    decisions = store.decisions()
+    rejected = {*decisions.rejected, *rejected} - approved
+    store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
+
+
+def _is_healthy() -> bool:
+    try:
+        return click.confirm(
+            "does it belong to the healthy machine? (n rejects it: it is not searched for again)", err=True
+        )
+    except click.Abort:
+        echo("", "no answer: nothing is kept; answer y or n, or give --yes", err=True)
+        raise
+
+
+def _commission_running(
+    machine: "LoadedMachine",
+    store: "StateStore",
+    span: tuple[float, float],
+    windows: int,
+    *,
+    approve_all: bool,
+    write: bool,
+) -> None:
+    """Commission by what a daemon has recorded and estimated from the first time of ``span`` to the second."""
+    from otolith.cli.commissioning.noise import HealthySpan, delay_lines, identified_record, noise_lines
+    from otolith.storage.history import HistoryReader, history_path
+    from otolith_drivers.errors import ConfigurationError
+
+    names = machine.file.machine
+    reader, data = HistoryReader(history_path(names.site, names.name)), HealthySpan(machine, *span)
+    echo(f"from {local_time(span[0])} to {local_time(span[1])}", err=True)
+    _warn_of_events(reader, span)
+    before = machine
+    try:
+        if write:
+            machine = _with_own_values(machine, data, windows)
+        record = identified_record(machine, data, windows)
+    except ConfigurationError as error:  # it records nothing, or not for so long
+        echo(f"values, noise and delays are as they were: {error}", err=True)
+    else:
+        if write:
+            machine = _with_noise_and_delays(machine, record.noise, record.delays)
+            echo("a running daemon takes these lines over when it is started again", err=True)
+        else:
+            echo(*noise_lines(machine, record.noise), *delay_lines(machine, record.delays))
+    known = store.decisions()
+    records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
+    approved, rejected = _asked(machine, records, approve_all=approve_all)
+    if records:
+        _decide(store, approved, rejected)
+    if machine.file.parameters == before.file.parameters:
+        histories, advice = _estimated(machine, reader, span)
+    else:  # what was estimated with other values does not count
+        state, advice = _replayed(machine, data)
+        histories = dict(state.health.histories)
+    keep_baseline(machine, store, histories, advice, labels=reader.labels())
+    echo("a running daemon takes the baseline over with its next window", err=True)
+
+
+def _warn_of_events(reader: "HistoryReader", span: tuple[float, float]) -> None:
+    """Name what the daemon announced in the time that is said to be healthy."""
+    from otolith.health.limits import Level
+
+    begin, end = span
+    parts = {
+        f"{row.part or 'machine'} {row.state} at {local_time(row.entered)}"
+        for row in reader.states(begin)
+        if row.state in (Level.WATCH, Level.ACT) and begin <= row.entered <= end
+    }
+    for text in sorted(parts):
+        echo(f"! {text}: was the machine healthy then? 'otolith history --events' shows it", err=True)
+
+
+def _estimated(
+    machine: "LoadedMachine", reader: "HistoryReader", span: tuple[float, float]
+) -> "tuple[dict[str, History], dict[str, str]]":
+    """Return the estimates of the daemon in a span (Unix times), and what would determine the others."""
+    from otolith.health.events import history_point
+    from otolith.health.prognosis import with_point
+    from otolith.health.schema import ReportDocument
+
+    histories: dict[str, History] = {}
+    advice: dict[str, str] = {}
+    after = 0
+    while texts := reader.messages("report", REPORTS_AT_ONCE, after, *span):
+        for text in texts:
+            document = ReportDocument.from_json(text)
+            after = document.sequence or after
+            advice |= {name: item.advice for name, item in document.parameters.items() if item.advice}
+            for name in document.parameters:
+                if (point := history_point(machine.plan, document, name)) is not None:
+                    histories[name] = with_point(histories.get(name, ()), *point)
+    return histories, advice
+
+
+@click.command()
+@MACHINE_FILE
+@click.option("--clear", is_flag=True, help="Return to the nominal values of FILE.")
+def baseline(file: Path, clear: bool) -> None:
+    """Take the present values of the machine in FILE as baseline.
+
+    It must be healthy. The values are the means of the saved estimates. Limits in percent refer to them
+    from then on, also those of a running daemon, with its next window.
+
+    \b
+    Examples:
+      otolith baseline my-machine.toml
+      otolith baseline my-machine.toml --clear
+    """
+    machine, store = loaded(file)
+    if clear:
+        store.save_decisions(replace(store.decisions(), baselines={}))
+        echo("limits in percent refer to the nominal values of the machine file")
+    else:
+        keep_baseline(machine, store, store.histories(), {})
+
+
+def keep_baseline(
+    machine: "LoadedMachine",
+    store: "StateStore",
+    histories: "Mapping[str, History]",
+    advice: Mapping[str, str],
+    *,
+    labels: "TimeLabels | None" = None,
+) -> None:
+    """Store and print the baselines of ``histories``, and of each parameter with limits that has none why.
+
+    Times of ``histories`` are those of the service; with ``labels`` they are Unix times.
+
+    Raises:
+        ConfigurationError: no parameter has a baseline.
+    """
+    from otolith.health.prognosis import find_baseline
+    from otolith_drivers.errors import ConfigurationError
+
+    limited = {name: row for name, row in machine.plan.parameters.items() if row.limits}
+    found = {name: find_baseline(histories.get(name, ()), row) for name, row in limited.items()}
+    kept = {name: row.baseline for name, row in found.items() if row.baseline is not None}
+    if labels is not None:
+        kept = {name: replace(item, end=labels.last(item.end)) for name, item in kept.items()}
+    if kept:
+        store.save_decisions(replace(store.decisions(), baselines={**store.decisions().baselines, **kept}))
+    lines = list[str]()
+    for name, search in found.items():
+        if (item := kept.get(name)) is not None:
+            lines += _baseline_lines(machine, labels or store.labels(), name, item)
+        else:
+            lines.append(f"{name}: no baseline, its limits stay as they were: {search.reason}")
+        if item is None or search.reason:
+            lines += [f"  {name} is not known well: {search.reason}"] if item is not None else []
+            lines.append(f"  what would determine it: {advice.get(name) or MORE_MOTION}")
+        if search.vague:
+            few = f"{search.vague} estimates of {name} are not counted"
+            why = f"near standstill, or without a change, a window shows it to ±{search.interval:.2g} only"
+            lines.append(f"  {few}: {why}")
+    if not kept:
+        lines.insert(0, f"no baseline: {'none of its parameters has limits' if not limited else 'too little is known'}")
+        raise ConfigurationError("\n".join(f"{machine.path}: {line.strip()}" for line in lines))
+    echo(*lines, err=True)
+
+
+def _baseline_lines(machine: "LoadedMachine", labels: "TimeLabels", name: str, item: "Baseline") -> Iterator[str]:
+    from otolith.health.limits import Level
+    from otolith.health.text import interval_text
+    from otolith_drivers.units import quantity_text
+
+    row = machine.plan.parameters[name]
+    text, end = interval_text(item.value, item.sd, row.unit), labels.unix(item.end)
+    yield f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}"
+    level, limit = row.level(item.value, item.sd, Level.OK)
+    if limit is not None:
+        beyond = f"{level} {limit.side} {quantity_text(limit.value, row.unit)}"
+        undo = "if the machine is not healthy, undo it: otolith baseline --clear"
+        yield f"{name}: beyond its limit {beyond}; {undo}"

@@ -1,0 +1,156 @@
+"""Changes of single keys of a machine file, which leave all other lines, with their comments, as they are.
+
+What a change makes is parsed and compared with what was meant, so that no layout of a file is misread: where it is not
+the same, nothing is written.
+"""
+
+import copy
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from otolith.machine import load_machine
+from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
+
+HEADER = re.compile(r"\s*\[\[?([^\]]*)\]\]?\s*(?:#.*)?")
+
+
+@dataclass(frozen=True, slots=True)
+class NewLine:
+    """The value of a key as it is to stand in a file."""
+
+    value: Any
+    remark: str = ""
+
+
+class Unchangeable(ValueError):  # noqa: N818 - it is told as part of another error
+    """A file in which a key cannot be changed by a line."""
+
+
+def with_keys(text: str, table: str, lines: Mapping[str, NewLine]) -> str:
+    """Return the file with keys of a table, which is added at the end if it is missing.
+
+    A key replaces its line, or the one with ``#`` that has its default. Raises Unchangeable.
+    """
+    rows = text.split("\n")
+    wanted = copy.deepcopy(tomllib.loads(text))
+    inside = wanted.setdefault(table, {})
+    if not isinstance(inside, dict):
+        raise Unchangeable(f"[{table}] is no table")
+    for name, line in lines.items():
+        inside[name] = line.value
+        rows = _with_key(rows, table, name, line)
+    return _checked("\n".join(rows), wanted, table)
+
+
+def with_delay(text: str, signal: str, delay: str, remark: str) -> str:
+    """Return the file with the ``delay`` of a signal; raises Unchangeable."""
+    wanted = copy.deepcopy(tomllib.loads(text))
+    table = wanted.setdefault("signals", {}).setdefault(signal, {})
+    if not isinstance(table, dict):
+        raise Unchangeable(f"signals.{signal} is no table")
+    is_new, before = not table, table.get("delay")
+    table["delay"] = delay
+    rows = text.split("\n")
+    if is_new:
+        line = NewLine({"delay": delay}, remark)
+        return _checked("\n".join(_with_key(rows, "signals", signal, line)), wanted, signal)
+    for number in _inside(rows, "signals") or ():
+        if not _is_key(rows[number], signal):
+            continue
+        row = rows[number]
+        ends = [match.start() for match in re.finditer(r"\}", row)] if before is None else [0]
+        for end in ends:
+            if before is None:
+                changed = f"{row[:end].rstrip()}, delay = {toml_value(delay)} {row[end:]}"
+            else:
+                changed = re.sub(r"(\bdelay\s*=\s*)(\"[^\"]*\"|'[^']*'|[^,}\s]+)", rf"\g<1>{toml_value(delay)}", row)
+            trial = "\n".join([*rows[:number], changed, *rows[number + 1 :]])
+            if _parsed(trial) == wanted:
+                return trial
+    try:
+        own = _with_key(rows, f"signals.{signal}", "delay", NewLine(delay, remark))
+        return _checked("\n".join(own), wanted, signal)
+    except ValueError as error:
+        raise Unchangeable(str(error)) from error
+
+
+def write_machine_file(file: Path, text: str) -> None:
+    """Replace a machine file at once and whole, with its mode, if the daemon accepts ``text``.
+
+    Raises:
+        ConfigurationError: the daemon does not accept it.
+        ServiceError: the folder cannot be written.
+    """
+    try:
+        handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
+    except OSError as error:
+        raise ServiceError(f"{file.parent}: cannot be written: {error.strerror}") from error
+    made = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        try:
+            load_machine(made, for_replay=True)
+        except ConfigurationError as error:
+            raise ConfigurationError(str(error).replace(str(made), str(file))) from error
+        made.chmod(file.stat().st_mode & 0o777 if file.exists() else 0o644)
+        made.replace(file)
+    finally:
+        made.unlink(missing_ok=True)
+
+
+def _with_key(rows: list[str], table: str, name: str, line: NewLine) -> list[str]:
+    remark = f"  {toml_comment(line.remark)}" if line.remark else ""
+    new = f"{toml_key(name)} = {toml_value(line.value)}{remark}"
+    places = _inside(rows, table)
+    if places is None:
+        return [*_without_blank_end(rows), "", f"[{table}]", new, ""]
+    same = [number for number in places if _is_key(rows[number], name)]
+    default = [number for number in places if _is_key(rows[number].lstrip().removeprefix("#"), name)]
+    if same or default:
+        number = (same or default)[0]
+        return [*rows[:number], new, *rows[number + 1 :]]
+    filled = [number for number in places if rows[number].strip()]
+    end = (filled[-1] if filled else places.start - 1) + 1
+    return [*rows[:end], new, *rows[end:]]
+
+
+def _without_blank_end(rows: list[str]) -> list[str]:
+    kept = list(rows)
+    while kept and not kept[-1].strip():
+        kept.pop()
+    return kept
+
+
+def _inside(rows: list[str], table: str) -> "range | None":
+    """Return the numbers of the lines in a table; None if it has no header."""
+    headers = [(number, match[1]) for number, row in enumerate(rows) if (match := HEADER.fullmatch(row))]
+    for place, (number, name) in enumerate(headers):
+        if re.sub(r"[\s\"']", "", name) == table:
+            end = headers[place + 1][0] if place + 1 < len(headers) else len(rows)
+            return range(number + 1, end)
+    return None
+
+
+def _is_key(row: str, name: str) -> bool:
+    return bool(re.match(rf"\s*(?:{re.escape(toml_key(name))}|\"{re.escape(name)}\")\s*=", row))
+
+
+def _checked(text: str, wanted: Mapping[str, Any], what: str) -> str:
+    if _parsed(text) != wanted:
+        raise Unchangeable(f"the lines of {what} have a layout that is not changed by itself")
+    return text
+
+
+def _parsed(text: str) -> dict[str, Any] | None:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return None

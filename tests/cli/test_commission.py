@@ -1,0 +1,133 @@
+"""``otolith commission``: from a log to a machine file with true values, and of a machine whose daemon runs."""
+
+import tomllib
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from otolith.adaptation.state import apply_decisions, initial_state
+from otolith.cli.main import cli
+from otolith.machine import load_machine
+from otolith.runtime.replay import Replay, open_recorded, replay_recorder
+from otolith.storage.history import describe_machine, history_directory
+from otolith.storage.log_history import log_history
+from otolith.storage.state_store import store_of
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.plant.dc_motor import MotorScenario, SetPoint
+from otolith_drivers.plant.scenario import simulate
+from tests.cli.commands import otolith, tables
+from tests.cli.replays import HEADING, MACHINE
+from tests.cli.test_init import UNITS_IN_THE_HEADER, german
+from tests.conftest import SIGNALS
+from tests.messages import assert_says, raises_saying
+
+BEGIN = 1_800_000_000.0  # Unix s
+WINDOWS, RECORDS, PERIOD = 25, 200, 0.01
+OWN = {"R_a": 2.1, "L_a": 0.12, "J": 4e-4, "K_e": 0.11, "K_t": 0.11, "D": 6e-4}
+
+
+@pytest.fixture
+def other(scenario: MotorScenario) -> MotorScenario:
+    """A motor that is far from the example of the twin, without a load."""
+    parameters = scenario.parameters.model_copy(update=OWN)
+    controller = scenario.controller.model_copy(update={"K_p": 0.15, "K_i": 0.4})
+    noise = scenario.noise.model_copy(update={"speed": 0.1})
+    update = {"parameters": parameters, "controller": controller, "load": 0.0, "faults": (), "noise": noise}
+    points = tuple(
+        SetPoint(at=f"{2 * place} s", speed=f"{speed} rad/s") for place, speed in enumerate((20, 60, -30, 80))
+    )
+    return scenario.model_copy(update={**update, "set_points": points, "repeat_every": 8.0})
+
+
+@pytest.mark.full
+def test_a_german_table_becomes_a_page_without_an_edit(tmp_path: Path, other: MotorScenario) -> None:
+    data, file = german(tmp_path / "montag.csv", other, UNITS_IN_THE_HEADER, 6000), tmp_path / "drive.toml"
+    result = otolith("init", file, "--csv", data, "--commission")
+    page = tmp_path / "drive.html"
+    assert f"next: otolith replay {file} {data} --report drive.html" in result.stdout.splitlines()
+    machine = load_machine(file)
+    values = dict(machine.problem.known) | {row.name: row.nominal for row in machine.problem.free}
+    assert {name: values[name] for name in OWN} == pytest.approx(OWN, rel=0.05)
+    assert tables(file)["signals"]["V_a"] == {"column": "U_A", "unit": "V"}  # nothing is late
+    baselines = store_of(machine).decisions().baselines
+    assert baselines["R_a"].value == pytest.approx(OWN["R_a"], rel=0.01)
+    summary = otolith("replay", file, data, "--report", page).stdout
+    assert_says(summary, "the twin explains 30 of 30", "OK")
+    assert "<html" in page.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def ran(tmp_path: Path, scenario: MotorScenario) -> Path:
+    """The file of a machine with state, history and recording of a daemon that ran for ``WINDOWS`` windows."""
+    file, data = tmp_path / "machine.toml", tmp_path / "samples.csv"
+    text = MACHINE.read_text(encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
+    healthy = scenario.model_copy(update={"faults": ()})
+    ticks = islice(simulate(healthy), WINDOWS * RECORDS)
+    rows = [
+        ",".join([repr(BEGIN + PERIOD * index), *(repr(float(tick.measured[name])) for name in SIGNALS.values())])
+        for index, tick in enumerate(ticks)
+    ]
+    data.write_text("\n".join([",".join(HEADING), *rows, ""]), encoding="utf-8")
+    machine = load_machine(file, with_driver=False)
+    names = machine.file.machine
+    folder = machine.recording_folder
+    folder.mkdir(parents=True)
+    recording = folder / f"{names.site}.{names.name}-20270115T080000-1.rrd"
+    with (
+        open_recorded(machine, data) as recorded,
+        log_history(history_directory(), names.site, names.name) as history,
+        replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
+    ):
+        run = Replay(machine, recorded)
+        for report in run.reports():
+            record(report)
+            history.add(report.document)
+        history.describe(describe_machine(machine.twin, machine.plan))
+    store = store_of(machine)
+    with store.locked():
+        store.save(run.state)
+    return file
+
+
+def test_a_running_machine_gets_a_baseline_and_keeps_what_it_has_learned(ran: Path) -> None:
+    machine = load_machine(ran, with_driver=False)
+    store = store_of(machine)
+    learned, text = store.components_path.read_bytes(), ran.read_text(encoding="utf-8")
+    span = ["--since", "2027-01-15T08:00:00+00:00", "--until", "2027-01-15T08:00:49+00:00"]
+    with store.locked():  # as a daemon that runs holds it
+        result = otolith("commission", ran, *span, "--windows", "4")
+    assert {"noise", "process_noise"} <= tomllib.loads(result.stdout).keys()
+    baseline = store.decisions().baselines["R_a"]
+    assert baseline.value == pytest.approx(6.5, rel=0.01)
+    assert baseline.windows == WINDOWS - 1  # the last one ends later
+    assert store.components_path.read_bytes() == learned
+    assert ran.read_text(encoding="utf-8") == text
+    state = initial_state("m", "s", machine.problem, machine.plan)
+    assert apply_decisions(state, store.decisions()).plan.parameters["R_a"].nominal == baseline.value
+
+
+def test_a_running_machine_gets_noise_into_its_file(ran: Path) -> None:
+    span = ["--since", "2027-01-15T08:00:00+00:00", "--until", "2027-01-15T08:01:00+00:00"]
+    result = otolith("commission", ran, *span, "--windows", "4", "--write")
+    assert_says(result.stderr, str(ran), "[noise]", "[process_noise]")
+    assert float(str(tables(ran)["noise"]["i"]).split()[0]) == pytest.approx(0.005, rel=0.2)
+    load_machine(ran, with_driver=False)
+
+
+def test_a_time_without_estimates_gives_no_baseline(ran: Path) -> None:
+    with raises_saying(ConfigurationError, "R_a", "20"):
+        otolith("commission", ran, "--since", "2027-01-16T08:00:00+00:00", "--until", "2027-01-16T09:00:00+00:00")
+    assert store_of(load_machine(ran, with_driver=False)).decisions().baselines == {}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["healthy.csv", "--last", "2h"], ["--last", "1h", "--since", "2h"], ["--since", "1h", "--until", "2h"]],
+    ids=" ".join,
+)
+def test_which_data_are_healthy_must_be_told(arguments: list[str]) -> None:
+    result = CliRunner().invoke(cli, ["commission", str(MACHINE), *arguments])
+    assert result.exit_code == 2

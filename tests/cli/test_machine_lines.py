@@ -1,0 +1,79 @@
+"""Changes of single keys of a machine file leave all its other lines as they are."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from otolith.cli.commissioning.machine_lines import NewLine, Unchangeable, with_delay, with_keys, write_machine_file
+from otolith_drivers.errors import ConfigurationError
+from tests.cli.replays import MACHINE
+from tests.hostile import HOSTILE
+
+TEXT = """# a comment, which stays
+[signals]
+V_a = { column = "U } [V]", unit = "V" }  # not { here }
+i = { column = "I", delay = "1 ms", unit = "A" }
+[signals.omega]
+column = "n"
+
+[parameters]
+# R_a = { value = "6.5 ohm", estimate = true }  # of the twin
+L_a = "0.6 H"     # by a bridge
+[noise]
+i = "5 mA"
+"""
+
+
+def test_a_key_replaces_its_line_or_its_default() -> None:
+    text = with_keys(TEXT, "parameters", {"R_a": NewLine("2.1 ohm", "new"), "L_a": NewLine({"value": "0.1 H"})})
+    lines = text.splitlines()
+    assert 'R_a = "2.1 ohm"  # new' in lines
+    assert 'L_a = { value = "0.1 H" }' in lines
+    kept = [line for line in TEXT.splitlines() if "R_a" not in line and "L_a" not in line]
+    assert [line for line in lines if "R_a" not in line and "L_a" not in line] == kept
+
+
+def test_a_new_key_is_the_last_of_its_table_and_a_new_table_the_last_of_the_file() -> None:
+    text = with_keys(
+        with_keys(TEXT, "noise", {"omega": NewLine("1 rad/s")}), "process_noise", {"i": NewLine("1 A/s^0.5")}
+    )
+    assert text.endswith('i = "5 mA"\nomega = "1 rad/s"\n\n[process_noise]\ni = "1 A/s^0.5"\n')
+
+
+@pytest.mark.parametrize("name", ["V_a", "i", "omega", "T_load"])
+def test_a_delay_enters_the_signal_however_it_is_written(name: str) -> None:
+    before, after = tomllib.loads(TEXT), tomllib.loads(with_delay(TEXT, name, "9.7 ms", "± 0.1 ms"))
+    assert after["signals"][name]["delay"] == "9.7 ms"
+    del after["signals"][name]["delay"]
+    before["signals"].setdefault(name, {}).pop("delay", None)
+    assert after == before
+
+
+def test_a_layout_that_is_not_understood_is_refused() -> None:
+    array = '[noise]\ni = [\n  "5 mA",\n]\n'
+    with pytest.raises(Unchangeable):
+        with_keys(array, "noise", {"i": NewLine("6 mA")})
+    with pytest.raises(Unchangeable):
+        with_keys('parameters.R_a = "1 ohm"\n', "parameters", {"R_a": NewLine("2 ohm")})
+
+
+@pytest.mark.parametrize("hostile", HOSTILE, ids=range(len(HOSTILE)))
+def test_a_text_from_outside_stays_a_value_or_a_remark(hostile: str) -> None:
+    text = with_keys(TEXT, "noise", {"i": NewLine("6 mA", hostile)})
+    assert tomllib.loads(text)["noise"] == {"i": "6 mA"}
+    assert set(tomllib.loads(text)) == set(tomllib.loads(TEXT))
+
+
+def test_what_the_daemon_refuses_is_not_written(tmp_path: Path) -> None:
+    file = tmp_path / "machine.toml"
+    text = MACHINE.read_text(encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
+    file.chmod(0o640)
+    with pytest.raises(ConfigurationError, match="nosie"):
+        write_machine_file(file, text + '\n[nosie]\ni = "5 mA"\n')
+    assert file.read_text(encoding="utf-8") == text
+    write_machine_file(file, text + "\n# more\n")
+    assert file.read_text(encoding="utf-8").endswith("# more\n")
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert list(tmp_path.iterdir()) == [file]
