@@ -1,5 +1,6 @@
 """``otolith commission``: from a log to a machine file with true values, and of a machine whose daemon runs."""
 
+import os
 import tomllib
 from itertools import islice
 from pathlib import Path
@@ -86,6 +87,7 @@ def ran(tmp_path: Path, scenario: MotorScenario) -> Path:
             record(report)
             history.add(report.document)
         history.describe(describe_machine(machine.twin, machine.plan))
+    os.utime(recording, (BEGIN + 60.0, BEGIN + 60.0))
     store = store_of(machine)
     with store.locked():
         store.save(run.state)

@@ -79,7 +79,7 @@ def own_values(
     wide = replace(problem, known=tuple(known), free=tuple(map(widened, free)), open_loop=False)
     usable = sorted(usable_windows(problem, windows), key=lambda window: -_movement(problem.base_model, window))
     chosen = usable[:FITTED_WINDOWS]
-    search = _Search(wide, sorted(chosen, key=lambda window: window.start), frozenset(loads), progress)
+    search = _ValueSearch(wide, sorted(chosen, key=lambda window: window.start), frozenset(loads), progress)
     return search.run() if chosen else OwnValues((), {}, np.inf, 0)
 
 
@@ -165,7 +165,7 @@ class _Together:
         return np.concatenate(residuals), np.concatenate(rows)
 
 
-class _Search:
+class _ValueSearch:
     def __init__(self, problem: Problem, windows: Sequence[Window], loads: frozenset[str], progress: Progress) -> None:
         self._problem, self._windows, self._loads, self._progress = problem, windows, loads, progress
         self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
