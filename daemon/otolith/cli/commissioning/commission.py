@@ -67,14 +67,14 @@ def commission(
     The data are DATA, a log; stop the daemon before. Or they are what the daemon has recorded since a time: then it
     goes on with all that it has learned, and takes over the baseline with its next window.
 
-    With --write and DATA, parameters that FILE does not state are identified first.
+    With --write, parameters that FILE does not state are identified first.
 
     \b
     Examples:
       otolith commission my-machine.toml monday.csv --write
       otolith commission my-machine.toml monday.csv --yes
       otolith commission my-machine.toml --last 2h
-      otolith commission my-machine.toml --since 2026-01-31T06:00 --until 2026-01-31T08:00
+      otolith commission my-machine.toml --since 2026-01-31T06:00 --until 2h
     """
     spans = [name for name, given in (("--last", last), ("--since", since), ("--until", until)) if given]
     if data is not None and spans:
