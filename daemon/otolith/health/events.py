@@ -42,6 +42,7 @@ from otolith.health.schema import (
     WindowDocument,
 )
 from otolith.health.text import PARTS, duration_text, reasons_of
+from otolith.health.trend import SeenTrend, seen_trend
 
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
@@ -91,6 +92,8 @@ class HealthState:
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
+    trends: Mapping[str, SeenTrend] = field(default_factory=dict)
+    """Of the parameters that were on their way to a limit, since their last sudden change."""
     undetermined: Mapping[str, float] = field(default_factory=dict)
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
     inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
@@ -112,10 +115,11 @@ class HealthState:
         return tuple(record.event for record in self.records.values() if record.event is not None)
 
     def without_history(self, name: str) -> "HealthState":
-        """Return the state without history and forecast of a parameter."""
+        """Return the state without history, forecast and trend of a parameter."""
         histories = {key: history for key, history in self.histories.items() if key != name}
         forecasts = {key: item for key, item in self.forecasts.items() if key != name}
-        return replace(self, histories=histories, forecasts=forecasts)
+        trends = {key: item for key, item in self.trends.items() if key != name}
+        return replace(self, histories=histories, forecasts=forecasts, trends=trends)
 
     def without_learned(self, reason: str) -> "HealthState":
         """Return the state of a machine of which nothing was learned; events of what was learned are dropped."""
@@ -233,7 +237,7 @@ def _observations(
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
-    past = Past(state.steps, spans, state.undetermined, state.doubtful, state.known_since)
+    past = Past(state.steps, spans, state.trends, state.undetermined, state.doubtful, state.known_since)
     shown = observe(plan, report, levels, past)
     return earlier | {item.key: item for item in shown}
 
@@ -360,15 +364,18 @@ def history_point(plan: MonitoringPlan, report: ReportDocument, name: str) -> tu
 
 
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
-    """Return the state with the values of this window in the histories, and with the forecasts that are due."""
-    histories, forecasts = dict(state.histories), dict(state.forecasts)
+    """Return the state with the values of this window in the histories, with the forecasts that are due, and trends."""
+    histories, forecasts, trends = dict(state.histories), dict(state.forecasts), dict(state.trends)
     for name in report.parameters:
         if (point := history_point(plan, report, name)) is None:
             continue
         histories[name] = with_point(histories.get(name, ()), *point)
         if is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(plan.parameters[name], histories[name])
-    return replace(state, histories=histories, forecasts=forecasts)
+        own, now = forecasts.get(name), report.window.end
+        if seen := seen_trend(plan.parameters[name], histories[name], own, trends.get(name), now):
+            trends[name] = seen
+    return replace(state, histories=histories, forecasts=forecasts, trends=trends)
 
 
 def _advance(

@@ -18,13 +18,13 @@ from otolith.health.schema import (
     Status,
 )
 from otolith.health.text import Texts, duration_text, forecast_text, interval_text, value_text
+from otolith.health.trend import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith_drivers.units import equation_text, quantity_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
 INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
 MIN_RETURNS = 4  # changes among as many windows, of which each was gone before the next: one that comes and goes
-MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a limit is passed
 LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
@@ -78,6 +78,7 @@ class Past:
 
     steps: Mapping[str, float]  # Last sudden change of each
     spans: Mapping[str, float]  # Length of the history of each, s
+    trends: Mapping[str, SeenTrend]  # See HealthState.trends
     undetermined: Mapping[str, float]  # Time for which the machine has moved since each was determined, s
     doubtful: tuple[int, ...] = ()  # See HealthState.doubtful
     known_since: float | None = None  # See HealthState.known_since
@@ -99,7 +100,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     observations.append(_of_returns(plan, report, before, past.doubtful))
     for name, parameter in report.parameters.items():
         own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
-        observations += [own, _of_trend(plan, report, name, own.level, past.spans.get(name, 0.0))]
+        observations += [own, _of_trend(plan, report, name, own.level, past)]
         observations.append(_of_lost(plan, report, name, parameter, past.undetermined.get(name, 0.0)))
     observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
@@ -207,20 +208,27 @@ def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
     return texts("beside", side=side, limit=quantity_text(limit.value, unit, digits=4))
 
 
-def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, span: float) -> Observation:
-    """Return whether a parameter at ``level`` is on its way to a limit, by a history of ``span`` s.
+def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, past: Past) -> Observation:
+    """Return whether a parameter at ``level`` is on its way to a limit; what is not seen for a while is left as it was.
 
     A trend that warming explains is none where no temperature is measured.
     """
-    parameter, quantity = report.parameters[name], plan.parameters.get(name, MonitoredQuantity())
-    forecast, key = parameter.forecast, f"trend/{name}"
-    if level is not Level.OK or forecast is None or parameter.value is None:
+    parameter, quantity, now = (
+        report.parameters[name],
+        plan.parameters.get(name, MonitoredQuantity()),
+        report.window.end,
+    )
+    key, length, seen = f"trend/{name}", past.spans.get(name, 0.0), past.trends.get(name)
+    if level is not Level.OK or parameter.forecast is None or parameter.value is None:
         return Observation(key, quantity.part, level and Level.OK)
-    crossings = [item for item in (forecast.watch, forecast.act) if item is not None and item.low > report.window.end]
-    is_sure = span >= MIN_TREND_SPAN and bool(crossings) and crossings[0].high is not None
-    if not is_sure or _warming(quantity, crossings[0].limit - quantity.nominal, plan.texts):
+    if seen is None or length < MIN_TREND_SPAN or seen.is_over(now):
         return Observation(key, quantity.part, Level.OK)
-    side = "below" if crossings[0].limit < quantity.nominal else "above"
+    crossing = next_crossing(parameter.forecast, now)
+    if crossing is None or not seen.is_lasting(now, length):
+        return Observation(key, quantity.part, None)
+    if _warming(quantity, crossing.limit - quantity.nominal, plan.texts):
+        return Observation(key, quantity.part, Level.OK)
+    side = "below" if crossing.limit < quantity.nominal else "above"
     features = FindingFeatures(FindingKind.TREND, report.twin, name, side, "trend")
     expected = forecast_text(parameter, report.window.end, plan.language)
     what = plan.texts.translated(quantity.meaning)

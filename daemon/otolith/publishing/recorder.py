@@ -29,7 +29,6 @@ from otolith.health.text import (
     announcements,
     approval_text,
     event_text,
-    forecast_text,
     headline,
     moment_text,
     probability_text,
@@ -409,10 +408,6 @@ def operator_text(document: ReportDocument) -> str:
     lines += [_plain(unknown)] if (unknown := unknown_text(health, current)) else []
     lines += [_plain(undecided)] if (undecided := undecided_text(document)) else []
     lines += [_paragraph(event, health.state) for event in current]
-    judged = {event.id.partition("@")[0].partition("/")[2] for event in current}
-    for name, item in document.parameters.items():
-        if name not in judged and (expected := forecast_text(item, document.window.end, health.language)):
-            lines.append(_plain(f"{name} {value_text(item)} {expected} (80 %)"))
     return texts.decimals("\n\n".join(lines))
 
 

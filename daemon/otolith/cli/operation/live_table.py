@@ -294,7 +294,7 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
     bad = document.window.quality.reasons
     lines = [Text(f"{texts('bad_window')}: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
-        if expected := forecast_text(parameter, document.window.end, texts.language):
+        if details and (expected := forecast_text(parameter, document.window.end, texts.language)):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
     candidates = [finding for finding in document.findings if finding.kind is FindingKind.OPEN]
     if (candidates or document.hints) and not details:
