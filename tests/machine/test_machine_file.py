@@ -140,7 +140,7 @@ def test_limits_are_relative_or_absolute(
 def test_the_twin_gives_limits_relative_to_the_value_of_the_machine(own_machine: OwnMachine) -> None:
     quantity = limits_of(own_machine, 'value = "10 ohm"').parameters["R_a"]
     assert quantity.part == "winding"
-    assert [limit.value for limit in quantity.limits] == pytest.approx([9.5, 12.5, 9.0, 14.5])
+    assert [limit.value for limit in quantity.limits] == pytest.approx([9.5, 14.5, 9.0, 16.5])
 
 
 def test_a_default_limit_beyond_the_bounds_is_no_error(own_machine: OwnMachine) -> None:
@@ -242,7 +242,7 @@ def test_what_is_no_limit_is_refused_with_a_remedy(own_machine: OwnMachine, limi
 def test_limits_of_the_twin_that_do_not_fit_are_not_blamed_on_the_machine_file(own_machine: OwnMachine) -> None:
     twin = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
     own = own_machine.machine.with_name("own-twin.toml")
-    own.write_text(twin.replace('watch = ["-5 %", "+25 %"]', 'watch = "6.2 ohm"'), encoding="utf-8")
+    own.write_text(twin.replace('watch = ["-5 %", "+45 %"]', 'watch = "6.2 ohm"'), encoding="utf-8")
     text = own_machine.machine.read_text(encoding="utf-8")
     own_machine.machine.write_text(text.replace('name = "dc_motor"', 'file = "own-twin.toml"'), encoding="utf-8")
     with pytest.raises(

@@ -268,9 +268,9 @@ def test_a_simulated_machine_is_described_in_words(simulated: dict[str, str], si
 
 def test_a_far_limit_is_only_in_words(simulated: dict[str, str]) -> None:
     shown = Page(simulated["degrading"])
-    assert "WATCH above 8.125" in shown.text
+    assert "WATCH above 9.425" in shown.text
     assert {"WATCH 6.37", "ACT 6.175"} <= set(shown.texts)
-    assert not {"WATCH 8.125", "ACT 9.425"} & set(shown.texts)
+    assert not {"WATCH 9.425", "ACT 10.73"} & set(shown.texts)
 
 
 @pytest.fixture(scope="module")

@@ -106,11 +106,11 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     service = Service(load_machine(path))
     store = store_of(service._machine)
     store.save_decisions(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
-    path.write_text(text.replace('"+45 %"', '"+60 %"'), encoding="utf-8")
+    path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
     service._reload()
     limited = service._supervisor._next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
-    assert max(limit.value for limit in limited.limits) == pytest.approx(1.6 * 6.1)
+    assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)
 
 
 @pytest.mark.parametrize(("declared", "left"), [("", ("V_a",)), (', times = "polled"', ())])
