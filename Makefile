@@ -8,7 +8,7 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test test-full system-test check bench paper clean
+.PHONY: help demo test test-full system-test check bench paper screens clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
@@ -20,6 +20,7 @@ help:
 	@echo "make check   ruff, mypy --strict, import rules"
 	@echo "make bench   print the benchmarks"
 	@echo "make paper   the scenarios of the paper: our figures beside the paper's, with plots"
+	@echo "make screens pictures and texts of every screen, for the docs, from one seeded run"
 	@echo "make clean   remove .venv and caches"
 
 demo: $(RUNTIME)
@@ -54,6 +55,9 @@ bench: $(BENCH)
 
 paper: $(DEV)
 	$(BIN)/python -m benchmarks.paper
+
+screens: $(DEV)
+	$(BIN)/python -m benchmarks.screens
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -40,8 +40,10 @@ class Browser:
         for domain in ("Page", "Network", "Runtime", "Log"):
             self._call(f"{domain}.enable")
 
-    def open(self, path: Path, width: int, height: int, *, is_phone: bool = False) -> None:
-        """Open a file in a window of that size in pixels."""
+    def open(self, path: Path, width: int, height: int, *, is_phone: bool = False, is_dark: bool = False) -> None:
+        """Open a file in a window of that size in pixels, as a person who prefers dark pages sees it or another one."""
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
+        self._call("Emulation.setEmulatedMedia", features=[scheme])
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
                    mobile=is_phone)  # fmt: skip
         self.events.clear()
@@ -53,9 +55,10 @@ class Browser:
         """Return the value of a JavaScript expression."""
         return self._call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
-    def picture(self) -> bytes:
-        """Return the window as PNG."""
-        return base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
+    def picture(self, *, is_whole: bool = False) -> bytes:
+        """Return the window, or the whole page, as PNG."""
+        shot = self._call("Page.captureScreenshot", format="png", captureBeyondViewport=is_whole)
+        return base64.b64decode(shot["data"])
 
     def pages(self) -> bytes:
         """Return the page as it is printed on A4, as PDF."""

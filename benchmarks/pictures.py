@@ -97,11 +97,11 @@ def recording_picture(reports: Sequence[Report], folder: Path) -> bytes:
     return image.read_bytes()
 
 
-def small(picture: bytes) -> bytes:
+def reduced(picture: bytes, size: tuple[int, int] = SIZE) -> bytes:
     """Return a PNG file in its size on a screen and with few colours."""
     output = BytesIO()
     whole = Image.open(BytesIO(picture)).convert("RGB")
-    image = whole if whole.size == SIZE else whole.resize(SIZE, Image.Resampling.LANCZOS)
+    image = whole if whole.size == size else whole.resize(size, Image.Resampling.LANCZOS)
     image.quantize(COLOURS, dither=Image.Dither.NONE).save(output, "PNG", optimize=True)
     return output.getvalue()
 
@@ -120,8 +120,8 @@ def main(folder: Path) -> None:
             file = place / "report.html"
             file.write_text(page(reports, place), encoding="utf-8")
             tab.open(file, *SIZE)
-            (folder / f"report-{situation}.png").write_bytes(small(tab.picture()))
-            (folder / f"recording-{situation}.png").write_bytes(small(recording_picture(reports, place)))
+            (folder / f"report-{situation}.png").write_bytes(reduced(tab.picture()))
+            (folder / f"recording-{situation}.png").write_bytes(reduced(recording_picture(reports, place)))
 
 
 if __name__ == "__main__":

@@ -281,7 +281,7 @@ def tab() -> Iterator[Browser]:
         yield opened
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 720), (360, 740)])
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844), (360, 740)])
 def test_a_page_logs_and_requests_nothing_in_a_browser(
     simulated: dict[str, str], tab: Browser, tmp_path: Path, width: int, height: int
 ) -> None:
@@ -300,8 +300,30 @@ def test_a_page_logs_and_requests_nothing_in_a_browser(
         assert tab.value(SMALLEST) >= 11
         assert name == "harmful" or tab.value(SPLIT) == []
         assert tab.value(CUT) == []
+        assert tab.value(LANES) or name == "empty"
 
 
+def test_a_page_is_dark_for_who_prefers_that(simulated: dict[str, str], tab: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(simulated["unbalance"], encoding="utf-8")
+    for is_dark in (False, True):
+        tab.open(path, 390, 844, is_phone=True, is_dark=is_dark)
+        card = tab.value(BRIGHTNESS.format("backgroundColor", ".card"))
+        assert (card < 60) is is_dark
+        for text in ("body", ".pale", ".do b", ".l-ACT", ".l-WATCH"):
+            assert abs(card - tab.value(BRIGHTNESS.format("color", text))) > 100, text
+        assert tab.value("document.documentElement.scrollWidth") <= 390
+
+
+BRIGHTNESS = """(() => {{
+  const numbers = getComputedStyle(document.querySelector('{1}')).{0}.match(/\\d+/g).map(Number);
+  return (numbers[0] + numbers[1] + numbers[2]) / 3;
+}})()"""
+"""Of a colour of the first such element, 0 to 255."""
+LANES = """[...document.querySelectorAll('.lane .bar')].every(
+  bar => [...bar.querySelectorAll('i')].some(part => part.getBoundingClientRect().width >= 1)
+) && document.querySelectorAll('.lane .bar').length > 0"""
+"""Whether each part has a lane that shows its states."""
 FIRST = "document.querySelectorAll('.verdict > .badge, .verdict .event:first-of-type')"
 VERDICT = f"Math.max(...[...{FIRST}].map(row => row.getBoundingClientRect().bottom))"
 """Lower edge of the state and of the first event, px."""

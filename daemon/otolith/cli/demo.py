@@ -313,7 +313,7 @@ class Demo:
             text = f"{unknown} of {len(rows)} estimates are missing or not that precise"
             self._print(f"{text}: the computer may be too busy to receive all samples", "yellow" if known else "red")
         for unbalance in unbalances:
-            self._print(str(unbalance), "green" if unbalance.right else "red")
+            self._print_wrapped(str(unbalance), "green" if unbalance.right else "red")
         events = {event.id: event for report in self._reports for event in report.events}  # each as it was last
         self._print_events(sorted(events.values(), key=lambda event: event.start))
         if (health := self._health) is not None:

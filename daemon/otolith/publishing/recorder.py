@@ -400,13 +400,15 @@ def operator_text(document: ReportDocument) -> str:
     if (health := document.health) is None:
         return f"# {document.machine}"
     texts = texts_in(health.language)
-    current = document.open_events
+    current, undecided = document.open_events, undecided_text(document)
     lines = [f"# {texts.translated(state_word(health))}"]
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
-        lines += [] if current else [_plain(health.reason or texts("all_well"))]
+        why = health.reason or ("" if undecided else texts("all_well"))
+        lines += [_plain(why)] if why and not current else []
     lines += [_plain(unknown)] if (unknown := unknown_text(health, current)) else []
-    lines += [_plain(undecided)] if (undecided := undecided_text(document)) else []
+    if undecided:
+        lines += [f"**{_plain(undecided)}**", f"**{texts('what_to_do')}: {_plain(texts('undecided_advice'))}**"]
     lines += [_paragraph(event, health.state) for event in current]
     return texts.decimals("\n\n".join(lines))
 

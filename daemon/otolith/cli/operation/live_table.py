@@ -205,6 +205,7 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
     lines = [Text(headline(health, local_time, own_lines), style=LEVEL_STYLES[health.state]), parts]
     if undecided := undecided_text(document, local_time):
         lines.append(Text(undecided, style="bold magenta"))
+        lines.append(Text(f"{texts('what_to_do')}: {texts('undecided_advice')}", style="bold"))
     for event in current:
         if not is_in_headline or event.state is not health.state:
             what, since = f"{say(event.state)}: {texts.part(event.part)}: {event.condition}", local_time(event.since)
