@@ -8,7 +8,7 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test test-full system-test check bench paper screens clean
+.PHONY: help demo test test-full system-test check conditions bench paper screens clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
@@ -18,6 +18,8 @@ help:
 	@echo "make system-test"
 	@echo "             as root on Debian: drivers against can-utils, systemd and libmodbus, in a guest that is booted"
 	@echo "make check   ruff, mypy --strict, import rules"
+	@echo "make conditions"
+	@echo "             write the pages docs/conditions.md and docs/conditions.de.md anew"
 	@echo "make bench   print the benchmarks"
 	@echo "make paper   the scenarios of the paper: our figures beside the paper's, with plots"
 	@echo "make screens pictures and texts of every screen, for the docs, from one seeded run"
@@ -49,6 +51,11 @@ check: $(DEV)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The pages of conditions in docs, from the rules of the diagnosis and their texts.
+conditions: $(DEV)
+	$(BIN)/python -m otolith explain --markdown > docs/conditions.md
+	$(BIN)/python -m otolith explain --markdown --language de > docs/conditions.de.md
 
 bench: $(BENCH)
 	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done

@@ -36,6 +36,7 @@ from otolith.cli.common import (
     shipped_directory,
 )
 from otolith.cli.operation.event import event
+from otolith.cli.operation.explain import explain
 from otolith.cli.operation.history import history, report, reproduce
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
@@ -365,6 +366,7 @@ COMMANDS: tuple[click.Command, ...] = (
     config,
     drivers,
     event,
+    explain,
     history,
     init,
     install,

@@ -48,6 +48,8 @@ class _Row(StrictModel):
     input: tuple[str, ...] = ()
     order: Range | None = None  # Lowest and highest order
     severity: Literal["HINT", "WATCH", "ACT"] = "WATCH"  # Level of what has no limits
+    stop: Literal["", "now", "soon", "no", "sensor"] = ""
+    """Whether to stop the machine; ``sensor`` if something that protects uses it, empty for what its state says."""
 
 
 class OwnRule(_Row):

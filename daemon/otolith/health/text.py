@@ -7,6 +7,7 @@ stays English.
 """
 
 import re
+import shlex
 import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ class Texts:
     language: Language
     rules: dict[str, dict[str, str]]  # Condition, cause and advice of each rule, by its id
     texts: dict[str, str]  # By key, with names in braces
+    conditions: dict[str, str]  # Of the pages of conditions, by key, with names in braces
     phrases: dict[str, str]  # Translations by the English phrase; empty for English
     patterns: tuple[tuple[re.Pattern[str], str], ...]  # The phrases with names in braces; the first that matches counts
 
@@ -97,7 +99,7 @@ def texts_in(language: Language) -> Texts:
     content = tomllib.loads(files("otolith.health").joinpath("texts", f"{language}.toml").read_text(encoding="utf-8"))
     phrases: dict[str, str] = content.get("phrases", {})
     patterns = tuple((_pattern(phrase), text) for phrase, text in phrases.items() if "{" in phrase)
-    return Texts(language, content["rules"], content["texts"], phrases, patterns)
+    return Texts(language, content["rules"], content["texts"], content["conditions"], phrases, patterns)
 
 
 def _pattern(phrase: str) -> re.Pattern[str]:
@@ -161,7 +163,8 @@ def moment_text(seconds: float) -> str:
 def event_text(event: EventDocument, when: Callable[[float], str] = moment_text, *, details: bool = False) -> str:
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text.
 
-    With ``details`` also what to write into the machine file, as the specialist reads it.
+    With ``details`` also what to write into the machine file, as the specialist reads it, and the command that explains
+    the condition.
     """
     return texts_in(event.language).decimals(_event_sentence(event, when, details=details))
 
@@ -176,10 +179,16 @@ def _event_sentence(event: EventDocument, when: Callable[[float], str], *, detai
         line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
         return f"{line}; {texts('dropped', reason=event.reason)}{notes}" if event.reason else f"{line}{notes}"
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
-    advice = "".join(f"; {text}" for text in (event.advice, event.setting if details else "") if text)
+    more = (event.setting, explain_command(event)) if details else ()
+    advice = "".join(f"; {text}" for text in (event.advice, *more) if text)
     state, since = texts.translated(event.state), when(event.since)
     values = {"state": state, "part": part, "condition": condition, "since": since, "text": event.text}
     return f"{texts('event', **values, sure=sure, advice=advice)}{notes}"
+
+
+def explain_command(event: EventDocument) -> str:
+    """Return the command that explains the conditions of an event without a network; empty if no rule has them."""
+    return shlex.join(["otolith", "explain", *event.condition_id.split()]) if event.condition_id else ""
 
 
 def note_texts(event: EventDocument, when: Callable[[float], str] = moment_text) -> list[str]:

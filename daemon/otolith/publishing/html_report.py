@@ -23,9 +23,11 @@ from otolith import __version__
 from otolith.acquisition.quality import is_of_calendar
 from otolith.estimation.information import QUANTILE
 from otolith.health import text
+from otolith.health.conditions import ConditionPage, pages_of
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import Texts, texts_in
+from otolith.machine import load_rules
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
@@ -163,10 +165,19 @@ def html_report(
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
         zone=zone, lanes=list(_lanes(axis, latest, states)), curves=curves, is_over=is_over,
         gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,
-        hints=[event for event, worst, _ in told if worst is Level.HINT], findings=reader.findings(since),
+        conditions=_conditions(reader, told, say), hints=[event for event, worst, _ in told if worst is Level.HINT],
+        findings=reader.findings(since),
         undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
     )  # fmt: skip
+
+
+def _conditions(
+    reader: HistoryReader, told: Iterable[tuple[EventDocument, Level, object]], texts: Texts
+) -> list[ConditionPage]:
+    """Return what the conditions of events mean, by the rules of the machine."""
+    rules = (*reader.own_rules(), *load_rules(texts.language))
+    return pages_of(dict.fromkeys(event.condition_id for event, _, _ in told), rules, texts)
 
 
 def _time_of_day(seconds: float) -> str:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan, Rule
 from otolith.health.labels import TimeLabels
 from otolith.health.limits import Level
 from otolith.health.schema import (
@@ -121,7 +121,9 @@ def describe_machine(
     places = {row.name: row.meaning for row in twin.sites}
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
     texts |= {} if file is None else {"file": str(file.absolute())}
-    return json_text({**texts, "values": values, "limits": limits, "sites": sites, "places": places})
+    rules = [rule.model_dump(mode="json", exclude={"is_own"}) for rule in plan.rules if rule.is_own]
+    keys = {"values": values, "limits": limits, "sites": sites, "places": places, "rules": rules}
+    return json_text({**texts, **keys})
 
 
 class _Description(BaseModel):
@@ -133,6 +135,7 @@ class _Description(BaseModel):
     values: dict[str, tuple[float | None, str, str]] = Field(default_factory=dict)
     limits: dict[str, tuple[tuple[Level, float, bool], ...]] = Field(default_factory=dict)
     sites: dict[str, tuple[str, str, str]] = Field(default_factory=dict)
+    rules: tuple[Rule, ...] = ()
     places: dict[str, str] = Field(default_factory=dict)  # Meanings of the sites
     log: dict[str, tuple[str, ...]] | None = None
 
@@ -351,6 +354,11 @@ class HistoryReader:
             return dict(json.loads(text))
 
         return next(iter(self._undamaged(rows, parse)), {})
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return the rules of the machine file, as :func:`describe_machine` wrote them."""
+        rules = _Description.model_validate(self.description()).rules
+        return tuple(rule.model_copy(update={"is_own": True}) for rule in rules)
 
     def labels(self) -> TimeLabels:
         """Return the Unix times of service times, as they are known now."""

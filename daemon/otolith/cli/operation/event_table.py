@@ -80,7 +80,7 @@ def print_changes(
     for event in changes:
         # The text of a cleared event begins with it.
         change = "" if event.end is not None else f"{say.translated(event.change or '')}: "
-        console.print(f"{change}{event_text(event, local_time)}", style=event_style(event))
+        console.print(f"{change}{event_text(event, local_time, details=True)}", style=event_style(event))
         if (bundle := bundles.get(event.sequence)) is not None:
             console.print(f"  otolith reproduce {shlex.quote(str(bundle))}", soft_wrap=True)
 

@@ -29,6 +29,7 @@ from otolith.health.text import (
     approval_text,
     duration_text,
     event_text,
+    explain_command,
     forecast_text,
     headline,
     interval_text,
@@ -214,6 +215,7 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
         lines.append(Text(f"{event.text}{sure}"))
         lines += [Text(note, style="magenta") for note in note_texts(event, local_time)]
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
+        lines += [Text(command, style="dim")] if (command := explain_command(event)) else []
         lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
     hints = document.hints if details else ()
     return [*lines, *(Text(event_text(event, local_time, details=True), style=HINT_STYLE) for event in hints)]
