@@ -355,10 +355,10 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
-    language = file.machine.language
+    language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)
     rules = (*(Rule(**rule.model_dump(), is_own=True) for rule in file.rule), *load_rules(language))
-    return MonitoringPlan(parameters, components, rules, language=language, known=known, signals=signals)
+    return MonitoringPlan(parameters, components, rules, language=language, timezone=zone, known=known, signals=signals)
 
 
 def _known(parameter: Parameter, context: Context) -> MonitoredQuantity:

@@ -20,6 +20,7 @@ from otolith.health.schema import Language
 from otolith.twin.definition import Definition
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.common.guard import GuardedSource
+from otolith_drivers.common.time_zones import check_time_zone
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.sources import SeveralSources
@@ -96,6 +97,8 @@ class MachineTable(StrictModel):
     name: Name
     site: Name = "site"
     language: Language = "en"  # Of states, events and advice
+    timezone: Annotated[str, AfterValidator(check_time_zone)] = ""
+    """IANA name of the plant's zone, in which people read times; also of dates in logs that name none."""
     on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()  # Command and arguments, run for each event
 
 
@@ -430,7 +433,7 @@ def _driver_config(
         )
         for signal in signals
     )
-    setup = Setup(own, source.path.parent, file.window.sample_period)
+    setup = Setup(own, source.path.parent, file.window.sample_period, file.machine.timezone)
     return DriverConfig(table.get("name", kind), place, kind, module, options, setup, source)
 
 

@@ -76,6 +76,7 @@ class Setup:
     signals: tuple[Signal, ...]
     folder: Path  # Files named in options are relative to this folder
     sample_period: float  # Period of the window's grid in s
+    timezone: str = ""  # IANA name of the zone of dates that name none; UTC without it
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,12 @@ import io
 
 import pytest
 
-from otolith.cli import common
 from otolith.cli.console import Terminal
 from otolith.cli.operation.event_table import event_table
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
 from otolith.health.text import texts_in
+from otolith.health.times import moment_text
 from tests.storage.histories import event
 
 BEGIN = 1_700_000_000.0  # Unix s, 2023-11-14 22:13:20 UTC
@@ -69,10 +69,10 @@ def test_only_the_newest_are_shown_where_there_is_little_room() -> None:
 
 def test_times_of_two_zones_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 
-    def changing(seconds: float) -> str:
-        return f"{common.local_time(seconds)[:19]} {'CET' if seconds < BEGIN + 5 else 'CEST'}"
+    def changing(seconds: float, _: str | None) -> str:
+        return f"{moment_text(seconds)[:19]} {'CET' if seconds < BEGIN + 5 else 'CEST'}"
 
-    monkeypatch.setattr("otolith.cli.operation.event_table.local_time", changing)
+    monkeypatch.setattr("otolith.cli.operation.event_table.moment_text", changing)
     rows = lines([change(str(at), RAISED, Level.WATCH, at) for at in (0.0, 10.0)])
     assert [row.split()[2] for row in rows] == ["CET", "CEST"]
 

@@ -87,7 +87,7 @@ def test_rows_that_come_twice_and_steps_back_are_counted(tmp_path: Path, rows: L
     preview = previewed(written(tmp_path, [*twice, *rows[500:]]))
     assert preview.signals["omega"].duplicates == 600
     assert preview.steps_back == 1
-    assert "1 step back in time in line 1202: t = 5 after t = 5.99" in preview.remarks
+    assert "1 step back in time in line 1202: t = 5 s after t = 5.99 s" in preview.remarks
     assert any(
         "at time and with the value of the sample before: 600 samples (32%)" in remark for remark in preview.remarks
     )

@@ -165,7 +165,9 @@ def test_table_rows_are_reordered_within_the_window(
     rows.insert(700, late)
     text = summed_up(written(tmp_path, rows), capsys)
     assert "; 4000 samples, 4 lost" in text
-    assert f"closed: 1, the first in line 702, with t = {float(late[0]):g} after t = 7 above" in text.replace("\n", " ")
+    assert f"closed: 1, the first in line 702, at t = {float(late[0]):g} s after t = 7 s above" in text.replace(
+        "\n", " "
+    )
 
 
 def test_table_locates_a_time_far_ahead(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:

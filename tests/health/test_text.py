@@ -28,13 +28,13 @@ from otolith.health.text import (
     event_text,
     finding_text,
     headline,
-    moment_text,
     summary,
     texts_in,
     undecided_text,
     value_cells,
     value_text,
 )
+from otolith.health.times import moment_text
 from tests.health.test_events import report
 from tests.messages import assert_says
 

@@ -8,11 +8,11 @@ import time
 import pytest
 from rich.console import Console
 
-from otolith.cli.common import local_time
 from otolith.cli.operation.live_table import BARS, LEVEL_STYLES, LiveTable, event_style, sparkline
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells
+from otolith.health.times import moment_text
 from otolith.machine import load_machine
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.recorder import _log_lines
@@ -153,7 +153,7 @@ def test_a_silent_machine_is_grey_and_dated_beside_a_running_one(width: int, mon
         console.print(table)
     silent, whole = capture.get().split("\x1b[1mz-runs")
     text = re.sub(r"\x1b\[[\d;]*m", "", silent)
-    assert f"no report since {local_time(at_act.window.end)} (67 min): connected" in " ".join(text.split())
+    assert f"no report since {moment_text(at_act.window.end)} (67 min): connected" in " ".join(text.split())
     value, half, *_ = value_cells(at_act.parameters["R_a"])
     assert value in text
     assert half in text

@@ -24,7 +24,7 @@ from rich.table import Table
 
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import initial_state
-from otolith.cli.common import DEMOS, INTERRUPTED, drain, local_time
+from otolith.cli.common import DEMOS, INTERRUPTED, drain
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.cli.terminal import echo_json
@@ -317,7 +317,7 @@ class Demo:
         events = {event.id: event for report in self._reports for event in report.events}  # each as it was last
         self._print_events(sorted(events.values(), key=lambda event: event.start))
         if (health := self._health) is not None:
-            state = headline(health, local_time, events.values())
+            state = headline(health, events=events.values())
             self._print_wrapped(f"state of the machine: {state}", LEVEL_STYLES[health.state])
         for line in self._closing_lines():
             self._print(line)
@@ -332,7 +332,7 @@ class Demo:
 
     def _print_events(self, events: Iterable[EventDocument]) -> None:
         for event in events:
-            self._print_wrapped(event_text(event, local_time), event_style(event))
+            self._print_wrapped(event_text(event), event_style(event))
 
     @property
     def _health(self) -> HealthDocument | None:

@@ -12,7 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from otolith.acquisition.quality import ReasonCounts, time_text
+from otolith.acquisition.quality import ReasonCounts
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, restore_components
 from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.console import Terminal
@@ -20,7 +20,8 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, 
 from otolith.cli.terminal import echo
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
-from otolith.health.text import component_text, event_text, finding_text, headline, undecided_text, value_cells
+from otolith.health.text import component_text, event_text, finding_text, headline, undecided_text, value_cells, zone_of
+from otolith.health.times import clock_in, in_local_time
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
@@ -65,23 +66,24 @@ class ReplaySummary:
         if self._first is None or self._last is None:
             yield Text("no window")
             return
-        last = self._last
+        last, zone = self._last, zone_of(self._last)
+        when = clock_in(zone)
         if last.health is not None:
             yield Text(headline(last.health, events=self._events.values()), style=LEVEL_STYLES[last.health.state])
         if undecided := undecided_text(last):
             yield Text(undecided, style="bold magenta")
-        yield title(last, f", from {time_text(self._first.window.start)} to {time_text(last.window.end)}")
+        yield title(last, f", from {when(self._first.window.start)} to {when(last.window.end)}")
         yield self._parameters(last, options.max_width)
         for reason in dict.fromkeys(parameter.reason for parameter in last.parameters.values() if parameter.reason):
             names = ", ".join(name for name, parameter in last.parameters.items() if parameter.reason == reason)
-            yield Text(f"{names} in the last window: {reason}", style="yellow")
+            yield Text(f"{names} in the last window: {in_local_time(reason, zone)}", style="yellow")
         for component in last.components:
-            yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
+            yield Text(f"{component_text(component)}, since {when(component.onset)}", style="bold red")
         for event in self._events.values():
             yield Text(event_text(event, details=True), style=event_style(event))
         candidates = (finding for finding in last.findings if finding.kind is FindingKind.OPEN)
-        yield from (Text(finding_text(finding), style="magenta") for finding in candidates)
-        yield from self._counts()
+        yield from (Text(in_local_time(finding_text(finding), zone), style="magenta") for finding in candidates)
+        yield from self._counts(zone)
 
     def _parameters(self, last: ReportDocument, width: int) -> Table:
         seen = [kind for kind in Status if any(self._statuses[name, kind] for name in last.parameters)]
@@ -92,7 +94,7 @@ class ReplaySummary:
             table.add_row(name, *value_cells(parameter), status, *counts)
         return table
 
-    def _counts(self) -> Iterator[Text]:
+    def _counts(self, zone: str | None) -> Iterator[Text]:
         windows, bad = self._decisions.total(), self._decisions[WindowDecision.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
         yield Text(f"{counted(windows, 'window')}: {windows - bad} good, {bad} bad; {explained}")
@@ -103,7 +105,7 @@ class ReplaySummary:
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
                 yield Text(f"  {count} good, but: {decision}", style="yellow")
         for count, example in self._reasons.most_frequent():
-            yield Text(f"  {count} bad like: {example}", style="red")
+            yield Text(f"  {count} bad like: {in_local_time(example, zone)}", style="red")
 
 
 def replay(
@@ -159,12 +161,12 @@ def replay(
                 if as_json:
                     echo(report.document.to_json())
     if as_json:
-        echo_warnings(data[0], run.warnings())
+        echo_warnings(data[0], (in_local_time(line, machine.plan.timezone) for line in run.warnings()))
         return
     console = Terminal(width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
-        console.print(line, soft_wrap=True)
+        console.print(in_local_time(line, machine.plan.timezone), soft_wrap=True)
 
 
 @contextmanager
@@ -206,5 +208,5 @@ def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool
     """Print to standard error what the first rows of ``data`` offer."""
     with suppress(OtolithError):  # the replay itself raises what is wrong with the file
         preview = preview_recording(machine, data, stopped, max_rows=PREVIEWED_ROWS)
-        for line in short_lines(preview):
+        for line in short_lines(preview, machine.plan.timezone):
             echo(line, err=True)

@@ -100,6 +100,7 @@ class MonitoringPlan:
     rules: Sequence[Rule] = ()
     stated: Mapping[str, MonitoredQuantity] | None = None  # As the machine file states them, if there is a baseline
     language: Language = "en"  # Of the texts for people
+    timezone: str = ""  # IANA name of the zone of times for people; that of the reader's computer without it
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
     signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings

@@ -431,6 +431,7 @@ def _raised(
     return EventDocument(
         id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
         start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
+        timezone=plan.timezone or None,
     )  # fmt: skip
 
 
@@ -452,14 +453,15 @@ def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence)
 
 def _description(
     plan: MonitoringPlan, event: EventDocument, observed: Observation, window: int
-) -> dict[str, str | EvidenceDocument]:
+) -> dict[str, str | EvidenceDocument | None]:
     """Return text, diagnosis and evidence of an observation that shows the condition, by the keys of the event."""
     texts = {"condition": str(observed.features.finding), "condition_id": str(observed.features.finding)}
     texts |= {"language": plan.language, **diagnose(plan.rules, observed.features, plan.texts)}
     texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
     numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
     texts["setting"] = observed.setting
-    return {**texts, "text": observed.text, "evidence": event.evidence.model_copy(update=numbers)}
+    evidence = event.evidence.model_copy(update=numbers)
+    return {**texts, "timezone": plan.timezone or None, "text": observed.text, "evidence": evidence}
 
 
 def _states(
@@ -498,7 +500,9 @@ def _states(
     whole = _kept(before, state, since, reason, unknown)
     ends = [item.shelved for item in same.values() if item.shelved is not None]
     shelved = min(ends) if ends and len(ends) == len(same) else None
-    return HealthDocument(**{**dict(whole), "shelved": shelved}, parts=parts, language=plan.language)
+    return HealthDocument(
+        **{**dict(whole), "shelved": shelved}, parts=parts, language=plan.language, timezone=plan.timezone or None
+    )
 
 
 def _begin(before: PartDocument | None, report: ReportDocument) -> float:

@@ -169,6 +169,7 @@ class EventDocument(DocumentModel):
     source: str = ""
     reason: str | None = None  # Why it is cleared although nothing shows that it is over: its learned state was dropped
     language: Language = "en"  # Of condition, text, cause, advice and reason
+    timezone: str | None = None  # IANA name of the plant's zone, in which people read times
     evidence: EvidenceDocument
     acknowledged: NoteDocument | None = None  # Who has seen it; None again once it is worse, or its diagnosis another
     shelved: NoteDocument | None = None  # While it is silent
@@ -205,6 +206,7 @@ class HealthDocument(PartDocument):
 
     parts: dict[str, PartDocument]
     language: Language = "en"  # Of the reasons
+    timezone: str | None = None  # IANA name of the plant's zone, in which people read times
 
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"

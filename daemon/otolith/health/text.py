@@ -9,12 +9,11 @@ stays English.
 import re
 import shlex
 import tomllib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 
-from otolith.acquisition.quality import time_text
 from otolith.discovery.decision import Approval
 from otolith.estimation.information import QUANTILE
 from otolith.health.limits import MACHINE, Level
@@ -33,6 +32,7 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
+from otolith.health.times import Clock, clock_in, in_local_time
 from otolith_drivers.units import equation_text, quantity_text, scale_of, unit_text
 
 UNKNOWN = "unknown"
@@ -155,21 +155,17 @@ def finding_text(finding: FindingDocument) -> str:
     return "; ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice, finding.setting]))
 
 
-def moment_text(seconds: float) -> str:
-    """A time of the data; that of an event, which is known to a window, has no fractions of a second."""
-    return re.sub(r"\.\d+ UTC$", " UTC", time_text(seconds))
-
-
-def event_text(event: EventDocument, when: Callable[[float], str] = moment_text, *, details: bool = False) -> str:
-    """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text.
+def event_text(event: EventDocument, when: Clock | None = None, *, details: bool = False) -> str:
+    """State, part, condition, begin, values, certainty and advice; ``when`` gives the times, by default of the plant.
 
     With ``details`` also what to write into the machine file, as the specialist reads it, and the command that explains
     the condition.
     """
-    return texts_in(event.language).decimals(_event_sentence(event, when, details=details))
+    sentence = _event_sentence(event, when or clock_in(event.timezone), details=details)
+    return texts_in(event.language).decimals(in_local_time(sentence, event.timezone))
 
 
-def _event_sentence(event: EventDocument, when: Callable[[float], str], *, details: bool) -> str:
+def _event_sentence(event: EventDocument, when: Clock, *, details: bool) -> str:
     texts = texts_in(event.language)
     part, condition = texts.part(event.part), event.condition
     if event.change is EventChange.NOTED:
@@ -191,7 +187,7 @@ def explain_command(event: EventDocument) -> str:
     return shlex.join(["otolith", "explain", *event.condition_id.split()]) if event.condition_id else ""
 
 
-def note_texts(event: EventDocument, when: Callable[[float], str] = moment_text) -> list[str]:
+def note_texts(event: EventDocument, when: Clock) -> list[str]:
     """What persons did with an event, a sentence each: until when it is shelved, who has seen it, and comments."""
     texts = texts_in(event.language)
 
@@ -252,14 +248,13 @@ def state_word(part: PartDocument) -> str:
     return UNKNOWN_STATE if part.undetermined else part.state
 
 
-def headline(
-    health: HealthDocument, when: Callable[[float], str] = moment_text, events: Collection[EventDocument] = ()
-) -> str:
+def headline(health: HealthDocument, when: Clock | None = None, events: Collection[EventDocument] = ()) -> str:
     """State of the machine, since when, and which parts are in it and why; also what is not known beside that.
 
     Reasons that several parts share are given once. Those of ``events``, which have lines of their own, are left out.
     """
     texts, told = texts_in(health.language), {event.condition for event in events}
+    when = when or clock_in(health.timezone)
     state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
     state += "" if health.shelved is None else f" ({texts('shelved_until', time=when(health.shelved))})"
     own = {name: part for name, part in health.parts.items() if part.state is health.state}
@@ -294,20 +289,27 @@ def unknown_text(health: HealthDocument, events: Collection[EventDocument] = ())
     return f"{texts.translated(Level.NO_DATA)}: {why}" if why else ""
 
 
-def undecided_text(document: ReportDocument, when: Callable[[float], str] = moment_text) -> str:
+def undecided_text(document: ReportDocument, when: Clock | None = None) -> str:
     """What is new, since when, and how many causes are possible, while it is open which one holds; else empty."""
     texts = texts_in(document.health.language) if document.health else texts_in("en")
     finding = next((item for item in document.findings if item.kind is FindingKind.OPEN), None)
     if finding is None:
         return ""
+    when = when or clock_in(zone_of(document))
     count, since = len(document.explanations), texts("since", time=when(finding.since))
     causes = texts("candidates", count=count) if count > 1 else ""
     return texts("undecided", what=finding.condition, since=since, causes=causes)
 
 
-def brief(document: ReportDocument, when: Callable[[float], str] = moment_text) -> str:
+def zone_of(document: ReportDocument) -> str | None:
+    """The zone of times for people; None for that of this computer."""
+    return None if document.health is None else document.health.timezone
+
+
+def brief(document: ReportDocument, when: Clock | None = None) -> str:
     """A report in one line of at most :data:`LINE` characters: time, state, and the parameters that have room."""
     state = "" if document.health is None else f" {state_word(document.health)}"
+    when = when or clock_in(zone_of(document))
     line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
     texts = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
     for index, text in enumerate(texts):

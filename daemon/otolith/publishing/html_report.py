@@ -7,7 +7,6 @@ left and from its top.
 
 import math
 import re
-import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,9 +25,11 @@ from otolith.health import text
 from otolith.health.conditions import ConditionPage, pages_of
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import Texts, texts_in
+from otolith.health.text import Texts, texts_in, zone_of
+from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
+from otolith_drivers.common.time_zones import local_moment
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
 
@@ -64,6 +65,7 @@ class Axis:
     begin: float
     now: float  # End of what is known; forecasts are beyond it
     end: float
+    zone: str | None = None  # That of the plant; None for that of this computer
 
     def x(self, seconds: float) -> float:
         """Return the position of a time."""
@@ -83,10 +85,11 @@ class Axis:
             return [(self.x(at), f"{at} s") for at in range(first, math.floor(self.end) + 1, step)]
         form = "%H:%M:%S" if step < 60 else "%H:%M" if span < DAY else texts("day_and_time" if step < DAY else "day")
         form = texts("month") if step > 30 * DAY else form
-        zone = time.localtime(self.begin).tm_gmtoff
-        first = math.ceil((self.begin + zone) / step) * step - zone
+        offset = local_moment(self.begin, self.zone).utcoffset()
+        ahead = 0 if offset is None else int(offset.total_seconds())
+        first = math.ceil((self.begin + ahead) / step) * step - ahead
         times = (first + index * step for index in range(MAX_TICKS + 1))
-        return [(self.x(at), time.strftime(form, time.localtime(at))) for at in times if at <= self.end]
+        return [(self.x(at), local_moment(at, self.zone).strftime(form)) for at in times if at <= self.end]
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +155,14 @@ def html_report(
         finalize=lambda value: _shown(value, say),
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
-    own_when = _time_of_day if is_of_calendar(axis.begin) else text.moment_text
-    own = {"when": own_when, "words": say.translated, "part": say.part}
-    own["whole"] = lambda written: whole(say.decimals(written))
+    is_dated = is_of_calendar(axis.begin)
+    own_when = (lambda seconds: f"{local_moment(seconds, axis.zone):%F %T}") if is_dated else clock_in(axis.zone)
+    own = {"when": own_when, "part": say.part}
+    own["words"] = lambda written: in_local_time(say.translated(written), axis.zone)
+    own["whole"] = lambda written: whole(in_local_time(say.decimals(written), axis.zone))
     environment.filters |= vars(text) | {"quantity_text": quantity_text} | own
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
-    zone = time.strftime("%Z", time.localtime(now)) if is_of_calendar(axis.begin) else ""
+    zone = f"{local_moment(now, axis.zone):%Z}" if is_dated else ""
     is_over = latest is not None and now <= latest.window.end
     return template.render(
         own_when=own_when,
@@ -180,10 +185,6 @@ def _conditions(
     return pages_of(dict.fromkeys(event.condition_id for event, _, _ in told), rules, texts)
 
 
-def _time_of_day(seconds: float) -> str:
-    return time.strftime("%F %T", time.localtime(seconds))
-
-
 def whole(written: str) -> Markup:
     """Return a text in which no line ends within a date, or a number and its unit; a long interval has its own."""
     texts = [Markup.escape(part) for part in WHOLE.split(visible(written))]
@@ -204,7 +205,7 @@ def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
     forecasts = [row.forecast for row in (latest.parameters.values() if latest else ()) if row.forecast]
     ends = [row.high or row.at for item in forecasts for row in (item.watch, item.act) if row and row.at > now]
     room = min(max(ends, default=now) - now, FORECAST_SHARE * (now - begin))
-    return Axis(begin, now, now + max(room, 0.0))
+    return Axis(begin, now, now + max(room, 0.0), zone_of(latest) if latest else None)
 
 
 def _gaps(times: Sequence[float], length: float) -> list[Span]:

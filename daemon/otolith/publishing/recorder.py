@@ -30,14 +30,15 @@ from otolith.health.text import (
     approval_text,
     event_text,
     headline,
-    moment_text,
     probability_text,
     state_word,
     texts_in,
     undecided_text,
     unknown_text,
     value_text,
+    zone_of,
 )
+from otolith.health.times import in_local_time, moment_text
 from otolith.machine import RecordedMachine
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith.twin.definition import Input, Output
@@ -356,10 +357,11 @@ def _statuses(document: ReportDocument) -> object:
 def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
     """Yield the lines of the log, each with its level."""
     reasons = document.window.quality.reasons
-    yield from ((reason, "WARN") for reason in reasons)
+    zone = zone_of(document)
+    yield from ((in_local_time(reason, zone), "WARN") for reason in reasons)
     for name, parameter in document.parameters.items():
         if parameter.status is not Status.ESTIMATED and not reasons:
-            yield f"{name} {parameter.status}: {parameter.reason}", "INFO"
+            yield f"{name} {parameter.status}: {in_local_time(parameter.reason, zone)}", "INFO"
     for event in announcements(document):
         yield event_text(event, details=True), "ERROR" if event.is_urgent else "INFO" if event.is_hint else "WARN"
     if document.fit is not None and not document.fit.explained:
@@ -403,7 +405,7 @@ def operator_text(document: ReportDocument) -> str:
     current, undecided = document.open_events, undecided_text(document)
     lines = [f"# {texts.translated(state_word(health))}"]
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
-        lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
+        lines[0] += f"\n{texts('since', time=moment_text(health.since, health.timezone))}"
         why = health.reason or ("" if undecided else texts("all_well"))
         lines += [_plain(why)] if why and not current else []
     lines += [_plain(unknown)] if (unknown := unknown_text(health, current)) else []
@@ -418,10 +420,11 @@ def _paragraph(event: EventDocument, worst: Level) -> str:
     say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     state = "" if event.state is worst else f"{say.translated(event.state)}: "
+    written = in_local_time(event.text, event.timezone)
     what = _plain(f"{state}{say.part(event.part)}: {event.condition}")
-    what = f"## {what}\n{say('since', time=moment_text(event.since))}"
+    what = f"## {what}\n{say('since', time=moment_text(event.since, event.timezone))}"
     advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
-    return "  \n".join(filter(None, [what, advice, _plain(f"{event.text}{sure}")]))
+    return "  \n".join(filter(None, [what, advice, _plain(f"{written}{sure}")]))
 
 
 def _plain(text: str) -> str:

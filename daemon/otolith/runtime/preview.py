@@ -16,13 +16,14 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from otolith.acquisition.playback import RecordingStatistics, SignalSampling
-from otolith.acquisition.quality import ReasonCounts
+from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
 from otolith.estimation.objective import Objective, adc_step
 from otolith.estimation.problem import Problem, WindowOptions
+from otolith.health.times import in_local_time
 from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
 from otolith.runtime.replay import Replay, Stopped, open_recorded
 from otolith.runtime.worker import perform, warm_up
@@ -366,7 +367,7 @@ def _remarks(
         line, time, before = statistics.first_step_back
         count = f"{counted(statistics.steps_back, 'step')} back in time"
         first = ", the first" if statistics.steps_back > 1 else ""
-        yield f"{count}{first} in line {line}: t = {time:.12g} after t = {before:.12g}"
+        yield f"{count}{first} in line {line}: {time_text(time)} after {time_text(before)}"
     shared: dict[str, list[str]] = {}
     for plan in plans:
         sampling = samplings[plan.name]
@@ -405,7 +406,7 @@ def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
         yield "no sample"
     if (gap := sampling.longest_gap_s) is not None:
         start, line = sampling.longest_gap_start, sampling.longest_gap_line
-        yield f"the longest gap is {duration_text(gap)}, from t = {start:.12g} s to line {line}"
+        yield f"the longest gap is {duration_text(gap)}, from {time_text(start or 0.0)} to line {line}"
     if sampling.duplicates:
         share = sampling.duplicates / sampling.samples
         count = f"{counted(sampling.duplicates, 'sample')} ({share:.0%})"
@@ -433,8 +434,8 @@ def computing_time_text(seconds: float, longest: float, length: float) -> str:
     return f"slower than real time: {text}" if seconds > length else text
 
 
-def preview_lines(preview: Preview) -> Iterator[str]:
-    """Yield the whole preview as lines of text, at most 80 columns wide."""
+def preview_lines(preview: Preview, zone: str | None = None) -> Iterator[str]:
+    """Yield the whole preview as lines of text, at most 80 columns wide, with times in a zone."""
     seconds = (preview.end or 0.0) - (preview.start or 0.0)
     yield f"{Path(preview.data).name}: {counted(preview.rows, 'row')} in {seconds:.6g} s"
     yield f"  {'signal':18}{'samples':>10}{'every':>9}{'jitter':>8}{'gaps':>7}{'longest':>9}{'step':>10}{'twice':>7}"
@@ -446,7 +447,7 @@ def preview_lines(preview: Preview) -> Iterator[str]:
         cells = f"{signal.samples:>10}{every:>9}{signal.jitter:>8.1%}{signal.gaps:>7}{longest:>9}{step:>10}"
         yield f"  {label if len(label) <= 18 else name[:18]:18}{cells}{signal.duplicates + signal.repeated_times:>7}"
     for remark in preview.remarks:
-        yield from _wrapped(f"! {remark}")
+        yield from _wrapped(f"! {in_local_time(remark, zone)}")
     yield from _window_lines(preview.windows)
     if preview.proposed != preview.windows:
         window = preview.proposed
@@ -461,15 +462,15 @@ def preview_lines(preview: Preview) -> Iterator[str]:
         yield from _wrapped(computing_time_text(*times, preview.proposed.length_s), indent="")
 
 
-def short_lines(preview: Preview) -> Iterator[str]:
-    """Yield the preview in a few lines, for the start of a replay."""
+def short_lines(preview: Preview, zone: str | None = None) -> Iterator[str]:
+    """Yield the preview in a few lines, for the start of a replay, with times in a zone."""
     rates: dict[str, list[str]] = {}
     for name, signal in preview.signals.items():
         rates.setdefault("-" if signal.interval_s is None else duration_text(signal.interval_s), []).append(name)
     every = "; ".join(f"{', '.join(names)} every {rate}" for rate, names in rates.items())
     yield from _wrapped(f"{counted(preview.rows, 'row')} of {Path(preview.data).name}: {every}")
     for remark in preview.remarks:
-        yield from _wrapped(f"! {remark}")
+        yield from _wrapped(f"! {in_local_time(remark, zone)}")
     yield from _window_lines(preview.windows)
     expected = [
         f"{name} " + (f"±{row.half_width:.2g} {unit_text(row.unit)}".rstrip() if row.half_width else "undetermined")

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, RecordingStatistics, median_step
+from otolith.acquisition.quality import time_text
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
@@ -110,7 +111,8 @@ def _open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> R
     def opened(wanted: Sequence[str]) -> Reader:
         ordinary = machine.twin.ordinary_range
         signals = tuple(Signal(name, units[name], data_format.Source(), ordinary(name)) for name in wanted)
-        return data_format.open_log(data, Setup(signals, machine.path.parent, machine.file.window.sample_period), None)
+        period, zone = machine.file.window.sample_period, machine.file.machine.timezone
+        return data_format.open_log(data, Setup(signals, machine.path.parent, period, zone), None)
 
     needed = [name for name in names if name not in machine.observed]
     if len(needed) < len(names):
@@ -272,7 +274,7 @@ class Replay:
         lines += self._data.warnings()
         if counts.first_late is not None:
             line, late_time, latest = counts.first_late
-            first = f"the first in {self._data.place} {line}, with t = {late_time:.12g} after t = {latest:.12g} above"
+            first = f"the first in {self._data.place} {line}, at {time_text(late_time)} after {time_text(latest)} above"
             lines.append(f"rows that came after their window was closed: {counts.late}, {first}")
         if counts.gaps:
             lines.append(
@@ -293,7 +295,9 @@ class Replay:
     def _why_no_window(self) -> str:
         rows = self._playback.counts.rows
         if rows > 1 and self.statistics.first == self.statistics.last:
-            return f"all {rows} rows have t = {self.statistics.first:.12g}: write t with all its digits"
+            return (
+                f"all {rows} rows have the same time, {time_text(self.statistics.first)}: write t with all its digits"
+            )
         reason = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} too short for a window of {self._length:g} s"
         return "; ".join([f"{reason}: record for longer, or shorten [window] length", *self.warnings()])
 
@@ -303,7 +307,8 @@ def _standstill(rows: Rows) -> str:
     begins = np.flatnonzero(np.diff(rows.times, prepend=np.nan, append=np.nan))
     longest = int(np.argmax(np.diff(begins)))
     first, last = int(begins[longest]), int(begins[longest + 1]) - 1
-    return f"t is {rows.times[first]:.12g} from line {rows.lines[first]} to line {rows.lines[last]}"
+    time = time_text(float(rows.times[first]))
+    return f"the time is {time} from line {rows.lines[first]} to line {rows.lines[last]}"
 
 
 @contextlib.contextmanager

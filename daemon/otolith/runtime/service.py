@@ -22,7 +22,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
@@ -40,6 +39,7 @@ from otolith.health.labels import clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
+from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
@@ -310,7 +310,10 @@ class Service:
             log.warning("%s", text)
         self._notes, self._saved = tuple(notes), _keys(state)
         if math.isfinite(end := state.posterior.belief.end):
-            log.info("started with what was learned up to %s", time_text(self._clock.labels.unix(end)))
+            log.info(
+                "started with what was learned up to %s",
+                moment_text(self._clock.labels.unix(end), self._machine.plan.timezone),
+            )
         if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
             names = ", ".join(known.component.key for known in state.adopted)

@@ -12,7 +12,7 @@ The period of a message, and the messages that are missing, follow from the time
 import math
 import statistics
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 
 # Thresholds: docs/reference/thresholds-drivers.md has the origin of each.
 MAX_DRIFT = 2e-4  # s per s between two clocks, beyond the 1e-4 of two quartz oscillators
@@ -29,9 +29,12 @@ MAX_OUTAGE = 60.0  # s; a longer silence is a stop of the sender, not a loss of 
 SILENT_PERIODS, MIN_SILENCE, MIN_IRREGULAR_SILENCE = 10.0, 0.5, 10.0  # periods; s; s
 
 
-def unix_time(moment: datetime) -> float:
-    """Return the seconds since 1970 of ``moment``, which is in UTC if it names no time zone."""
-    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+def unix_time(moment: datetime, zone: tzinfo = UTC) -> float:
+    """Return the seconds since 1970 of ``moment``, which is in ``zone`` if it names no time zone.
+
+    An hour that comes twice, as at the end of summer time, is the first of both.
+    """
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=zone)).timestamp()
 
 
 class ExchangeClock:

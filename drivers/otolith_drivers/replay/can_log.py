@@ -14,7 +14,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TextIO, cast
 
@@ -27,6 +27,7 @@ from otolith_drivers.canbus.database import EXTENDED_LIMIT
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CLASSIC_LENGTH
 from otolith_drivers.common.message_times import unix_time
+from otolith_drivers.common.time_zones import zone_named
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.replay import readers
 from otolith_drivers.replay.mf4 import Mf4Frames
@@ -56,6 +57,8 @@ logging.getLogger("can.io").setLevel(logging.ERROR)  # it warns of each bad line
 class CandumpLines:
     """The frames in what ``candump -ta`` or ``-tA`` prints; raises ValueError on a line that has none."""
 
+    zone: tzinfo = UTC  # Of the dates
+
     def __init__(self, lines: Iterator[str]) -> None:
         self._lines = lines
 
@@ -74,7 +77,7 @@ class CandumpLines:
                 raise ValueError("not as many bytes as it says")
             is_long, is_error = len(match["id"]) > STANDARD_DIGITS, bool(identifier & ERROR_FLAG)
             yield can.Message(
-                timestamp=_candump_time(match["time"]),
+                timestamp=_candump_time(match["time"], self.zone),
                 channel=match["channel"],
                 arbitration_id=identifier & EXTENDED_LIMIT,
                 is_extended_id=is_long and not is_error,
@@ -86,9 +89,9 @@ class CandumpLines:
             )
 
 
-def _candump_time(written: str) -> float:
-    """Seconds; a date has no time zone, and counts as UTC."""
-    return unix_time(datetime.fromisoformat(written)) if "-" in written else float(written)
+def _candump_time(written: str, zone: tzinfo) -> float:
+    """Seconds; a date has no time zone, and is in ``zone``."""
+    return unix_time(datetime.fromisoformat(written), zone) if "-" in written else float(written)
 
 
 class SavvyCanLines:
@@ -172,7 +175,8 @@ def open_log(path: Path, setup: Setup, can: Any | None) -> "CanLogReader":
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
     if can is None:
         raise ConfigurationError(f"{path}: a CAN log: its frames need a description, like that of type = 'can'")
-    return CanLogReader(path, tuple(signal.name for signal in setup.signals), decoder_of(can, setup))
+    names, zone = tuple(signal.name for signal in setup.signals), zone_named(setup.timezone)
+    return CanLogReader(path, names, decoder_of(can, setup), zone)
 
 
 def frames_in(path: Path) -> Iterator[can.Message]:
@@ -193,12 +197,15 @@ class CanLogReader(Reader):
 
     sampling = Sampling.CYCLIC
 
-    def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder) -> None:
-        """Open ``path``; raise ConfigurationError if the file is missing, or its format cannot be read."""
+    def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder, zone: tzinfo = UTC) -> None:
+        """Open ``path``; raise ConfigurationError if the file is missing, or its format cannot be read.
+
+        ``zone`` is that of dates that name none.
+        """
         data = DataFile(path)
         super().__init__(path, data)
         try:
-            self._source = _frames_of(path, data)
+            self._source = _frames_of(path, data, zone)
         except BaseException:
             data.close()
             raise
@@ -358,7 +365,7 @@ TEXT_FORMATS = {
 SUFFIXES = {".asc": readers.ASC, ".trc": readers.TRC}  # of texts whose first lines may not show the format
 
 
-def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
+def _frames_of(path: Path, data: DataFile, zone: tzinfo = UTC) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
     """The frames of a log, by first line or suffix; raise ConfigurationError, with the format, for another one."""
     suffix, head = suffix_of(path), head_of(path)
     if suffix == ".mf4":
@@ -372,7 +379,7 @@ def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFr
         cause = f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
         raise ConfigurationError(cause)
     text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
-    return TextFrames(path, TEXT_FORMATS[name], text)
+    return TextFrames(path, TEXT_FORMATS[name], text, zone)
 
 
 class _NumberedLines:
@@ -412,8 +419,8 @@ class TextFrames:
     place = "line"
     notes: tuple[str, ...] = ()
 
-    def __init__(self, path: Path, kind: TextFormat, text: TextIO) -> None:
-        self._path, self._kind = path, kind
+    def __init__(self, path: Path, kind: TextFormat, text: TextIO, zone: tzinfo) -> None:
+        self._path, self._kind, self._zone = path, kind, zone
         self._lines = _NumberedLines(text)
         self._taken = 0
 
@@ -426,6 +433,8 @@ class TextFrames:
         """Number of each line with its frame, or with the reason why it has none; can be iterated once."""
         lines = self._lines
         reader = self._kind.reader(lines)
+        if isinstance(reader, CandumpLines):
+            reader.zone = self._zone
         while True:
             try:
                 for frame in reader:

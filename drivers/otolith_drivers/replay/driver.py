@@ -81,7 +81,7 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
         replace(signal, source=validated(signal.source.model_dump(), kind.Source, ("signals", signal.name)))
         for signal in setup.signals
     )
-    wanted = Setup(signals, setup.folder, setup.sample_period)
+    wanted = replace(setup, signals=signals)
 
     def open_file() -> Reader:
         try:

@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -26,6 +26,7 @@ import pyarrow.compute as pc
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
 from otolith_drivers.common.message_times import unix_time
+from otolith_drivers.common.time_zones import zone_named
 from otolith_drivers.config_files import Range, StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
@@ -146,7 +147,8 @@ def open_log(path: Path, setup: Setup, _: object = None) -> "TableReader":
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
     units = {signal.name: signal.unit for signal in setup.signals}
     ordinary = {signal.name: signal.ordinary for signal in setup.signals if signal.ordinary is not None}
-    return TableReader(path, units, {signal.name: signal.source for signal in setup.signals}, ordinary)
+    sources = {signal.name: signal.source for signal in setup.signals}
+    return TableReader(path, units, sources, ordinary, zone_named(setup.timezone))
 
 
 class TableReader(Reader):
@@ -161,17 +163,19 @@ class TableReader(Reader):
         units: Mapping[str, str],
         sources: Mapping[str, TableSource] | None = None,
         ordinary: Mapping[str, Range] | None = None,
+        zone: tzinfo = UTC,
     ) -> None:
         """``units`` has the unit of each wanted signal, ``sources`` the column of a signal that has another name.
 
-        ``ordinary`` has the values of each input in ordinary operation, in its unit.
+        ``ordinary`` has the values of each input in ordinary operation, in its unit. ``zone`` is that of dates that
+        name none.
 
         Raises:
             ConfigurationError: the file is missing or no text, or a wanted column is missing.
         """
         data = DataFile(path)
         super().__init__(path, data)
-        self.counts, self._times = TableCounts(), EvenTimes()
+        self.counts, self._times, self._zone = TableCounts(), EvenTimes(), zone
         named = {name: (sources or {}).get(name, TableSource()) for name in units}
         self._wanted = {
             name: ColumnRequest(source.column or name, units[name], source.unit) for name, source in named.items()
@@ -215,7 +219,7 @@ class TableReader(Reader):
         lines = pc.list_flatten(pc.split_pattern(pa.array([text]), "\n"))
         lengths = pc.utf8_length(lines).to_numpy()
         _check_length(f"{self.path}:{first + int(lengths.argmax())}", int(lengths.max()))
-        rows = _TableChunk(self._header, self.counts, lines, first).rows(quoted='"' in text)
+        rows = _TableChunk(self._header, self.counts, self._zone, lines, first).rows(quoted='"' in text)
         if rows is not None:
             yield from self._times.of(rows)
 
@@ -414,9 +418,10 @@ def _split_quoted(line: str, separator: str) -> list[str]:
 class _TableChunk:
     """Some lines of a table. What is bad in them is added to the counts."""
 
-    def __init__(self, header: Header, counts: TableCounts, lines: pa.Array, first: int) -> None:
-        """``first`` is the number of the first of ``lines``."""
+    def __init__(self, header: Header, counts: TableCounts, zone: tzinfo, lines: pa.Array, first: int) -> None:
+        """``first`` is the number of the first of ``lines``, and ``zone`` that of dates that name none."""
         self._header, self._counts, self._lines, self._first = header, counts, lines, first
+        self._zone = zone
         self._bad: Integers = np.zeros(len(lines), dtype=np.int64)  # bad rows and cells of each line
 
     def rows(self, *, quoted: bool) -> Rows | None:
@@ -435,7 +440,7 @@ class _TableChunk:
         counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
         times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
         dates = np.flatnonzero(np.isinf(times))
-        times[dates] = list(map(_date, texts[TIME].take(pa.array(dates)).to_pylist()))
+        times[dates] = [_date(text, self._zone) for text in texts[TIME].take(pa.array(dates)).to_pylist()]
         timed = self._timed(times, texts.pop(TIME), cells, kept)
         kept = kept[timed]
         if not len(kept):
@@ -581,8 +586,8 @@ def _other_sign(text: str, decimal: str) -> str:
     return f", but {decimal!r} is the decimal sign of other cells" if decimal and is_number(text) else ""
 
 
-def _date(text: str) -> float:
-    """The Unix time (s) of a date, in UTC if it names no zone; infinity for another text."""
+def _date(text: str, zone: tzinfo) -> float:
+    """The Unix time (s) of a date, in ``zone`` if it names none; infinity for another text."""
     with contextlib.suppress(ValueError):
-        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")))
+        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")), zone)
     return math.inf

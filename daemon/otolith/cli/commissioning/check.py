@@ -67,7 +67,7 @@ def check_data(path: Path, data: Path, *, as_json: bool) -> bool:
     if as_json:
         echo_json(preview.document(), indent=2)
         return preview.is_usable
-    echo(*describe(machine, preview.sources), *preview_lines(preview))
+    echo(*describe(machine, preview.sources), *preview_lines(preview, machine.plan.timezone))
     if not preview.is_usable:
         windows = "no window can be used" if preview.windows.count else "the data are too short for a window"
         echo(f"{windows} as {path.name} configures them")

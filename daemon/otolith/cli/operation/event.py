@@ -89,7 +89,7 @@ def list_(machine: str, as_json: bool) -> None:
         echo_json({"events": [item.model_dump(mode="json", exclude_none=True) for item in rows]})
         return
     for item in rows:
-        echo(_key(item), f"  {event_text(item, local_time, details=True)}")
+        echo(_key(item), f"  {event_text(item, details=True)}")
     for key in known.shelves.keys() - {_key(item) for item in rows}:
         until = local_time(known.labels.unix(known.shelves[key].note.until or 0.0))
         echo(key, f"  no event is open; one that begins is shelved until {until}")

@@ -9,12 +9,12 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from otolith.cli.common import local_time
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
 from otolith.health.text import PARTS, Texts, event_text, note_texts
+from otolith.health.times import clock_in, in_local_time, moment_text
 
 DATE = len("2026-01-31 ")  # characters of a time before the time of day
 TIMES = DATE + len("23:59:59")
@@ -39,7 +39,7 @@ def event_table(changes: Iterable[EventDocument], width: int, say: Texts, newest
     """
     rows = _rows(changes)[-(newest or 0) :]
     words = say.translated
-    zones = {local_time(row.event.start)[TIMES:] for row in rows}
+    zones = {moment_text(row.event.start, row.event.timezone)[TIMES:] for row in rows}
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold", width=min(width, MAX_WIDTH))
     length = TIMES if len(zones) < 2 else TIMES + max(map(len, zones))
     titles = [words("since"), say("state"), say("part"), say("cause"), say("is_cleared")]
@@ -50,15 +50,15 @@ def event_table(changes: Iterable[EventDocument], width: int, say: Texts, newest
     table.add_column(reason, overflow="fold", ratio=1)
     table.add_column(cleared, width=NARROW_END if width < WIDTH_WITH_ENDS else None, overflow="fold")
     for row in rows:
-        event, begin = row.event, local_time(row.event.start)[:length]
+        event, begin = row.event, moment_text(row.event.start, row.event.timezone)[:length]
         is_over = event.end is not None
         end = "" if event.change is EventChange.NOTED else say("not_cleared")
         if is_over and event.change is not EventChange.NOTED:
-            end = local_time(event.end or 0.0)[:length]
+            end = moment_text(event.end or 0.0, event.timezone)[:length]
             end = end[DATE:] if end[:DATE] == begin[:DATE] else end
         worst = Text(words(row.worst), style=LEVEL_STYLES[row.worst] if not is_over else "")
         why = [say("dropped", reason=event.reason)] if event.reason else []
-        cause = PARTS.join([event.condition, *why, *note_texts(event, local_time)])
+        cause = PARTS.join([event.condition, *why, *note_texts(event, clock_in(event.timezone))])
         table.add_row(begin, worst, say.part(event.part), cause, Text(end, style="" if is_over else "bold"))
     return table
 
@@ -80,13 +80,16 @@ def print_changes(
     for event in changes:
         # The text of a cleared event begins with it.
         change = "" if event.end is not None else f"{say.translated(event.change or '')}: "
-        console.print(f"{change}{event_text(event, local_time, details=True)}", style=event_style(event))
+        console.print(f"{change}{event_text(event, details=True)}", style=event_style(event))
         if (bundle := bundles.get(event.sequence)) is not None:
             console.print(f"  otolith reproduce {shlex.quote(str(bundle))}", soft_wrap=True)
 
 
-def print_findings(console: Terminal, findings: Sequence[Mapping[str, Any]], say: Texts) -> None:
-    """Print each finding as a paragraph."""
+def print_findings(console: Terminal, findings: Sequence[Mapping[str, Any]], say: Texts, zone: str | None) -> None:
+    """Print each finding as a paragraph, with times in a zone."""
+    when = clock_in(zone)
     for finding in findings:
-        values = {"first": local_time(finding["first"]), "last": local_time(finding["last"]), "count": finding["count"]}
-        console.print(say.decimals(say("finding_of", text=say.translated(finding["text"]), **values)))
+        values = {"first": when(finding["first"]), "last": when(finding["last"]), "count": finding["count"]}
+        console.print(
+            say.decimals(say("finding_of", text=in_local_time(say.translated(finding["text"]), zone), **values))
+        )

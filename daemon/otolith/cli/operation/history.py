@@ -229,18 +229,19 @@ def _print_table(
 ) -> None:
     from otolith.cli.console import Localised, Terminal
     from otolith.cli.operation.event_table import event_table, print_changes, print_findings
+    from otolith.health.times import moment_text
 
-    console, say = Terminal(highlight=True), _texts(reader)
+    console, (say, zone) = Terminal(highlight=True), _texts(reader)
     first = min((sample.time for sample in samples), default=since)
     values = say("values_per", interval=say.translated(interval)) if samples else ""
-    begin = local_time(max(first, since))
+    begin = moment_text(max(first, since), zone)
     console.print(say("history_of", machine=reader.machine, site=reader.site, time=begin, values=values))
     if samples:
         console.print(Localised(_table(samples, console.width, say), say.decimals))
     findings = reader.findings(since) if has_findings else []
     if details:
         print_changes(console, events, _bundles(reader, since), say)
-        print_findings(console, findings, say)
+        print_findings(console, findings, say, zone)
     else:
         newest = MAX_EVENTS if samples else None
         if events:
@@ -254,11 +255,12 @@ def _print_table(
         echo("no values or events since then", err=True)
 
 
-def _texts(reader: "HistoryReader") -> "Texts":
-    """Return the texts in the language of the machine, as its last report has it."""
+def _texts(reader: "HistoryReader") -> "tuple[Texts, str | None]":
+    """Return the texts in the language of the machine, and the zone of its times, as its last report has them."""
     from otolith.health.text import texts_in
 
-    return next((texts_in(report.health.language) for report in reader.latest(1) if report.health), texts_in("en"))
+    healths = [report.health for report in reader.latest(1) if report.health]
+    return (texts_in(healths[0].language), healths[0].timezone) if healths else (texts_in("en"), None)
 
 
 def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":

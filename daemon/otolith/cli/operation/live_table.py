@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.window import Verdict
-from otolith.cli.common import drain, local_time
+from otolith.cli.common import drain
 from otolith.cli.console import Localised, Terminal
 from otolith.cli.machines import last_spoken
 from otolith.cli.terminal import echo
@@ -40,7 +40,9 @@ from otolith.health.text import (
     undecided_text,
     value_cells,
     value_text,
+    zone_of,
 )
+from otolith.health.times import clock_in, in_local_time
 from otolith_drivers.grammars.json_lines import checked_line
 from otolith_drivers.units import equation_text, quantity_text
 
@@ -92,23 +94,26 @@ class _Machine:
         """
         document, silence = self.document, time.monotonic() - self.received
         texts = texts_of(document)
-        head = [title(document)] if in_short else []
-        parts = Localised(Group(*self._parts(width, in_short, details)), texts.decimals)
-        if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
-            silent = texts("silent", time=local_time(document.window.end), duration=duration_text(silence))
-            return [
-                *head,
-                Text(f"{texts.decimals(silent)}: {state}", style="bold red"),
-                _Grey(parts),
-            ]
+        times = {"time": clock_in(zone_of(document))(document.window.end), "duration": duration_text(silence)}
+        is_silent = silence > SILENT_WINDOWS * (document.window.end - document.window.start)
+        age = "" if is_silent else f", {texts('age', **times)}"
+        head = [title(document, age)] if in_short else []
+        parts = Localised(Group(*self._parts(width, age, in_short=in_short, details=details)), texts.decimals)
+        if is_silent:
+            line = f"{texts.decimals(texts('silent', **times))}: {state}"
+            return [*head, Text(line, style="bold red"), _Grey(parts)]
         return [*head, parts]
 
-    def _parts(self, width: int, in_short: bool, details: bool) -> list[RenderableType]:
+    def _parts(self, width: int, age: str, *, in_short: bool, details: bool) -> list[RenderableType]:
         document, texts = self.document, texts_of(self.document)
         table = _parameters(document.parameters, self.histories, width, texts)
         if in_short:
             return [*state_lines(document, details=details), table, Text()]
-        parts: list[RenderableType] = [*state_lines(document, details=details), *_title_lines(document, texts), table]
+        parts: list[RenderableType] = [
+            *state_lines(document, details=details),
+            *_title_lines(document, texts, age),
+            table,
+        ]
         parts += [_components(document, width, texts)] if document.components else []
         return [*parts, *_messages(document, texts, details=details), *_counters(document, texts)]
 
@@ -200,25 +205,25 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
     say = texts.translated
     for name, part in health.parts.items():
         parts.append(f"{texts.part(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
-    current = document.open_events
+    current, when = document.open_events, clock_in(zone_of(document))
     is_in_headline = len(current) == 1  # several events have a line each instead
     own_lines = () if is_in_headline else current
-    lines = [Text(headline(health, local_time, own_lines), style=LEVEL_STYLES[health.state]), parts]
-    if undecided := undecided_text(document, local_time):
+    lines = [Text(headline(health, events=own_lines), style=LEVEL_STYLES[health.state]), parts]
+    if undecided := undecided_text(document):
         lines.append(Text(undecided, style="bold magenta"))
         lines.append(Text(f"{texts('what_to_do')}: {texts('undecided_advice')}", style="bold"))
     for event in current:
         if not is_in_headline or event.state is not health.state:
-            what, since = f"{say(event.state)}: {texts.part(event.part)}: {event.condition}", local_time(event.since)
+            what, since = f"{say(event.state)}: {texts.part(event.part)}: {event.condition}", when(event.since)
             lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
         sure = f" ({probability})" if (probability := probability_text(event)) else ""
-        lines.append(Text(f"{event.text}{sure}"))
-        lines += [Text(note, style="magenta") for note in note_texts(event, local_time)]
+        lines.append(Text(f"{in_local_time(event.text, zone_of(document))}{sure}"))
+        lines += [Text(note, style="magenta") for note in note_texts(event, when)]
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
         lines += [Text(command, style="dim")] if (command := explain_command(event)) else []
         lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
     hints = document.hints if details else ()
-    return [*lines, *(Text(event_text(event, local_time, details=True), style=HINT_STYLE) for event in hints)]
+    return [*lines, *(Text(event_text(event, details=True), style=HINT_STYLE) for event in hints)]
 
 
 def parameter_table(*columns: str, width: int, texts: Texts | None = None) -> Table:
@@ -240,14 +245,14 @@ def _table(width: int) -> Table:
     return Table(box=box.HEAVY_HEAD if has_lines else None, pad_edge=has_lines, collapse_padding=not has_lines)
 
 
-def _title_lines(document: ReportDocument, texts: Texts) -> list[Text]:
+def _title_lines(document: ReportDocument, texts: Texts, age: str) -> list[Text]:
     window, quality = document.window, document.window.quality
     line = Text(f"{texts('window')} {window.index} ")
     line.append(texts.translated(quality.verdict), style="green" if quality.verdict is Verdict.GOOD else "red")
     line.append(f", {texts('sampling', records=window.records, jitter=f'{quality.jitter_s * 1e3:.1f}')}")
     if document.fit is not None and document.cost.seconds is not None:
         line.append(f", {texts('computed', milliseconds=f'{document.cost.seconds * 1e3:.0f}')}")
-    return [title(document), line]
+    return [title(document, age), line]
 
 
 def _parameters(
@@ -276,14 +281,14 @@ def _parameter_line(name: str, parameter: ParameterDocument, say: Callable[[str]
 
 
 def _components(document: ReportDocument, width: int, texts: Texts) -> RenderableType:
-    table, say, lines = _table(width), texts.translated, []
+    table, say, lines, when = _table(width), texts.translated, [], clock_in(zone_of(document))
     for column in ("component", "equation", "amplitude", "since", "status"):
         table.add_column(say(column), overflow="fold")  # a truncated equation would be a wrong one
     for component in document.components:
         amplitude = component.values["amplitude"]
         text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
         status = f"{say(component.status)}, {approval_text(component, texts)}"
-        cells = say(component.meaning), equation_text(component.equation), text, local_time(component.onset), status
+        cells = say(component.meaning), equation_text(component.equation), text, when(component.onset), status
         table.add_row(*cells)
         lines.append(Text("{}: {}: {}, {}, {}".format(*cells)))
     return Group(*lines) if width < WIDTH_WITH_COMPONENTS else table
@@ -295,7 +300,8 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
     While it is open which cause holds, or the machine file has to be corrected, reasons and advice are details.
     """
     bad = document.window.quality.reasons
-    lines = [Text(f"{texts('bad_window')}: {reason}", style="red") for reason in bad]
+    zone = zone_of(document)
+    lines = [Text(f"{texts('bad_window')}: {in_local_time(reason, zone)}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
         if details and (expected := forecast_text(parameter, document.window.end, texts.language)):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
@@ -306,9 +312,10 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         names: dict[str, list[str]] = {}
         for name, parameter in document.parameters.items():
             names.setdefault(getattr(parameter, key) or "", []).append(name)
-        lines += [Text(f"{', '.join(own)}: {text}", style=style) for text, own in names.items() if text]
+        shown = ((", ".join(own), in_local_time(text, zone)) for text, own in names.items() if text)
+        lines += [Text(f"{own}: {text}", style=style) for own, text in shown]
     for finding in candidates:
-        lines.append(Text(f"{texts('open_test')}: {finding.text}", style="magenta"))
+        lines.append(Text(f"{texts('open_test')}: {in_local_time(finding.text, zone)}", style="magenta"))
         lines += [Text(f"  {text}", style="cyan") for text in (finding.advice, finding.setting) if text]
     if document.fit is not None:
         units, rows = document.fit.units, document.fit.rmse_estimated.items()

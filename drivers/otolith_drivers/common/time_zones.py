@@ -1,0 +1,37 @@
+"""Time zones by their IANA names, such as Europe/Berlin."""
+
+import difflib
+from datetime import UTC, datetime, tzinfo
+from zoneinfo import ZoneInfo, available_timezones
+
+
+def check_time_zone(name: str) -> str:
+    """Return the name of a time zone, or none; raise ValueError, with the most similar name, if no zone has it."""
+    try:
+        zone_named(name)
+    except (ValueError, OSError, KeyError) as error:  # ZoneInfoNotFoundError is a KeyError
+        raise ValueError(f"{name!r} is no time zone: write its IANA name, like {_nearest(name)!r}") from error
+    return name
+
+
+def _nearest(name: str) -> str:
+    """Return the name of the most similar zone, which people may know by its city; of one zone if none is similar."""
+    names = {zone.rpartition("/")[2].casefold(): zone for zone in sorted(available_timezones()) if "/" in zone}
+    city = name.rpartition("/")[2].casefold().replace(" ", "_")
+    similar = difflib.get_close_matches(city, names, n=1)
+    return names[similar[0]] if similar else "Europe/Berlin"
+
+
+def zone_named(name: str) -> tzinfo:
+    """Return the time zone of a checked name; UTC for none."""
+    return ZoneInfo(name) if name else UTC
+
+
+def local_moment(seconds: float, zone: str | None = None) -> datetime:
+    """Return a Unix time in a zone by its checked name; in that of this computer without one."""
+    return datetime.fromtimestamp(seconds, zone_named(zone or "")).astimezone(zone_named(zone) if zone else None)
+
+
+def utc_seconds(text: str) -> float:
+    """Return the Unix time of a date in UTC; raise ValueError if it is none."""
+    return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
