@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from otolith.health.limits import Level, Limit, MonitoredQuantity
-from otolith.health.prognosis import History, forecast, is_due, span, with_point
+from otolith.health.prognosis import QUIET, History, SeenTrend, forecast, is_due, seen_trend, span, with_point
 from otolith.health.schema import CrossingDocument, ForecastDocument
-from otolith.health.trend import QUIET, SeenTrend, seen_trend
 from tests.variants import often
 
 HOUR, DAY, STEP, SD = 3600.0, 86400.0, 900.0, 0.0003  # s, s, s, relative

@@ -28,7 +28,7 @@ from otolith.health.observations import (
     is_determined,
     observe,
 )
-from otolith.health.prognosis import History, forecast, is_due, span, with_point
+from otolith.health.prognosis import History, SeenTrend, forecast, is_due, seen_trend, span, with_point
 from otolith.health.schema import (
     EventChange,
     EventDocument,
@@ -42,7 +42,6 @@ from otolith.health.schema import (
     WindowDocument,
 )
 from otolith.health.text import PARTS, duration_text, reasons_of
-from otolith.health.trend import SeenTrend, seen_trend
 
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes

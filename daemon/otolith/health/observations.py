@@ -8,6 +8,7 @@ from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, probability_beyond
+from otolith.health.prognosis import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith.health.schema import (
     ComponentDocument,
     ComponentStatus,
@@ -18,7 +19,6 @@ from otolith.health.schema import (
     Status,
 )
 from otolith.health.text import Texts, duration_text, forecast_text, interval_text, value_text
-from otolith.health.trend import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith_drivers.units import equation_text, quantity_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level

@@ -12,6 +12,10 @@ Recognition and Machine Learning, section 3.5). These three are summed over a gr
 is, so that a forecast is the average over all models by their evidence.
 
 The baseline is the begin of that history: the values while the machine was healthy, to which relative limits refer.
+
+A load that changes each shift or each day moves temperatures, and with them parameters, up and down. Each slope of such
+a cycle is a trend that would pass a limit if it went on. A trend is therefore announced only where the cycles before it
+never led, and it is over only after a day without it.
 """
 
 import itertools
@@ -45,6 +49,11 @@ REFINED = 0.2  # of the points of a grid: how many must have weight so that it i
 MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, from which on it counts
 FACTOR_SHAPE = 1.5  # of the inverse gamma prior of the factor on the variances, and its scale: its mode is 0.6
 UNKNOWN_CONSTANT = 100.0  # standard deviation of the constant, over that of the change
+MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a limit is passed
+MIN_WAY = 0.5  # of the way from the healthy value to a limit, that the value must have gone
+MIN_BEYOND = 0.1  # of that way, by which it must be further than in the older half of its history
+HOLD, MAX_HOLD = 0.05, 3600.0  # of the length of the history, and s: for which this must be so, the shorter one
+QUIET = 86400.0  # s without it, after which it is over: a day, the longest cycle of most loads
 BISECTIONS = 40  # of the time of a crossing: more than a number has digits
 
 History = tuple[tuple[float, float, float], ...]  # Time (s), value and variance of a parameter; the times rise
@@ -375,3 +384,54 @@ def with_baseline(quantity: MonitoredQuantity, baseline: Baseline | None) -> Mon
         replace(limit, value=ratio * limit.value) if limit.is_relative else limit for limit in quantity.limits
     )
     return replace(quantity, nominal=baseline.value, limits=limits, has_baseline=True)
+
+
+@dataclass(frozen=True, slots=True)
+class SeenTrend:
+    """Since when and until when a parameter was on its way to a limit, service times in s."""
+
+    since: float
+    until: float
+
+    def is_over(self, now: float) -> bool:
+        """Whether it was not seen for so long that its event ends."""
+        return not 0.0 <= now - self.until < QUIET
+
+    def is_lasting(self, now: float, length: float) -> bool:
+        """Whether it is seen ``now``, and has been for long enough, in a history of ``length`` s."""
+        return self.until == now and now - self.since >= _hold(length)
+
+
+def _hold(length: float) -> float:
+    """Return for how long a trend must be seen in a history of ``length`` s, s."""
+    return min(HOLD * length, MAX_HOLD)
+
+
+def seen_trend(
+    quantity: MonitoredQuantity,
+    history: History,
+    forecast: ForecastDocument | None,
+    before: SeenTrend | None,
+    now: float,
+) -> SeenTrend | None:
+    """Return when the trend of a history was seen, up to ``now``; None if it never was."""
+    if (crossing := next_crossing(forecast, now)) is None or not _is_new(quantity, history, crossing.limit):
+        return before
+    goes_on = before is not None and 0.0 <= now - before.until < _hold(span(history))
+    return SeenTrend(before.since if before is not None and goes_on else now, now)
+
+
+def next_crossing(forecast: ForecastDocument | None, now: float) -> CrossingDocument | None:
+    """Return the next limit that will be passed, if it is known up to when."""
+    both = () if forecast is None else (forecast.watch, forecast.act)
+    first = next((item for item in both if item is not None and item.low > now), None)
+    return None if first is None or first.high is None else first
+
+
+def _is_new(quantity: MonitoredQuantity, history: History, limit: float) -> bool:
+    """Whether the value has gone far towards the limit, and further than in the older half of its history."""
+    way = limit - quantity.nominal
+    gone = [(value - quantity.nominal) / way for _, value, _ in history]
+    middle = history[-1][0] - 0.5 * span(history)
+    older = [share for share, (time, _, _) in zip(gone, history, strict=True) if time <= middle]
+    return gone[-1] >= MIN_WAY and gone[-1] >= max(older, default=0.0) + MIN_BEYOND
