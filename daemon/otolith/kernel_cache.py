@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 MAX_BYTES = 200_000_000  # of the cache: the least recently used kernels beyond are removed
 MIN_FREE_BYTES = 32 << 20  # of the disk of the cache, below which kernels are kept in another folder
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
+SOURCE = "(source of a twin)"
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
 
@@ -54,7 +55,7 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
         if not file.exists():
             folder.mkdir(mode=0o700, exist_ok=True)
             _write(file, make_source())
-            _report(CompileStep("(source of a twin)", is_end=True, compiled=True))
+            _report(CompileStep(SOURCE, is_end=True, compiled=True))
             _remove_old(store, keep=folder)
         os.utime(folder)
         return _import(name, file)
@@ -91,6 +92,11 @@ class CompileStep(NamedTuple):
     kernel: str
     is_end: bool
     compiled: bool  # At the end: whether it was compiled, and not loaded
+
+    @property
+    def is_kernel(self) -> bool:
+        """Whether it is a kernel, and not the source of the kernels of a twin."""
+        return self.kernel != SOURCE
 
 
 _observers: list[Callable[[CompileStep], None]] = []

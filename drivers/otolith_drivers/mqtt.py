@@ -306,6 +306,11 @@ class MqttListener(ThreadedDriver):
         self._connection.stay_down("not connected yet")
         self._start("mqtt-listen", self._run, deliver)
 
+    @property
+    def has_failed_first(self) -> bool:
+        """Whether the first attempt to connect has failed."""
+        return self._connection.has_failed_first
+
     def counters(self) -> Counters:
         messages = self._messages
         return Counters(messages.received, messages.bad, messages.lost, self._connection.count)

@@ -60,13 +60,16 @@ class ObservedMessages(Messages):
 def observe(
     options: MqttOptions, folder: Path, seconds: float, stopped: Callable[[], bool], topics: str = ALL
 ) -> ObservedMessages:
-    """Return what came within ``seconds``, connecting included; raise DeviceError if the broker refuses or is none."""
+    """Return what came within ``seconds``, connecting included; raise DeviceError if the broker refuses or is none.
+
+    It does so at once: whoever asks waits for it.
+    """
     messages = ObservedMessages(options, topics)
     driver = listener(options, Setup((), folder, 1.0), messages)
     driver.open(lambda _: None)
     try:
         end = time.monotonic() + seconds
-        while time.monotonic() < end and not stopped():
+        while time.monotonic() < end and not (stopped() or driver.has_failed_first):
             time.sleep(PAUSE)
         link = driver.link()
     finally:

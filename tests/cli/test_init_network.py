@@ -4,6 +4,7 @@ import json
 import math
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -23,6 +24,7 @@ from tests.drivers.mqtt_broker import broker_of_this_process, publisher
 from tests.drivers.opcua_server import opcua_server
 from tests.drivers.registers import registers
 from tests.messages import raises_saying
+from tests.waiting import PATIENCE
 
 
 @pytest.fixture
@@ -114,6 +116,19 @@ def test_a_source_that_is_not_there_leaves_no_file(tmp_path: Path) -> None:
         with pytest.raises(DeviceError, match=str(port)):
             otolith("init", tmp_path / "new.toml", kind, target.format(port), "--seconds", 0.3)
     assert list(tmp_path.glob("*.toml")) == []
+
+
+def test_a_port_that_is_closed_is_told_at_once(tmp_path: Path) -> None:
+    """And not after the time for which it would listen."""
+    for kind, target in (
+        ("--modbus", "127.0.0.1:{}"),
+        ("--opcua", "opc.tcp://127.0.0.1:{}"),
+        ("--mqtt", "127.0.0.1:{}"),
+    ):
+        port, begun = free_port(socket.SOCK_STREAM), time.monotonic()
+        with pytest.raises(DeviceError, match=str(port)):
+            otolith("init", tmp_path / "new.toml", kind, target.format(port), "--seconds", 3600)
+        assert time.monotonic() - begun < PATIENCE, kind
 
 
 def test_messages_of_any_kind_are_bounded_and_give_no_number_that_a_field_cannot_name() -> None:

@@ -17,13 +17,15 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.state import initial_state
 from otolith.cli.main import cli
 from otolith.health.schema import Report
-from otolith.kernel_cache import CompileStep
+from otolith.kernel_cache import SOURCE, CompileStep
 from otolith.machine import load_machine
 from otolith.runtime.worker import (
     COMPILE_TIMEOUT,
     MAX_WAITING_WINDOWS,
     NOT_READY,
+    WARM_UP_KERNELS,
     WINDOW_TIMEOUT,
+    Preparation,
     Ready,
     Supervisor,
     perform,
@@ -133,6 +135,7 @@ machine, steps = load_machine(Path(sys.argv[1]), with_driver=False), []
 state = initial_state("motor", "here", machine.problem, machine.plan)
 with kernel_cache.observed(steps.append):
     assert not worker.warm_up(state)
+    assert sum(step.is_end and step.is_kernel for step in steps) == worker.WARM_UP_KERNELS, steps
     print(len(steps))
     worker.WARM_UP_RECORDS = 200
     for seed in range(3):
@@ -188,6 +191,27 @@ def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
     supervisor.worker = worker  # type: ignore[assignment]  # has the methods that are used
     supervisor.submit(batch[0], 0.0)
     return supervisor, worker
+
+
+def test_how_far_a_worker_is_that_starts_is_known_until_it_is_ready(batch: list[Window]) -> None:
+    supervisor, worker = slow(batch)
+    assert supervisor.preparation == Preparation(0, WARM_UP_KERNELS, False)
+    worker.sent = [
+        CompileStep(SOURCE, is_end=True, compiled=True),
+        CompileStep("first", is_end=False, compiled=False),
+        CompileStep("first", is_end=True, compiled=False),
+        CompileStep("second", is_end=False, compiled=False),
+        CompileStep("second", is_end=True, compiled=True),
+        CompileStep("third", is_end=False, compiled=False),
+    ]
+    supervisor.poll(1.0)
+    assert supervisor.preparation == Preparation(2, WARM_UP_KERNELS, True)
+    worker.sent = [Ready()]
+    supervisor.poll(2.0)
+    assert supervisor.preparation is None
+    worker.sent = [CompileStep("rare", is_end=True, compiled=True)]
+    supervisor.poll(3.0)
+    assert supervisor.preparation is None
 
 
 STEP = COMPILE_TIMEOUT + WINDOW_TIMEOUT  # s; less than a step may take

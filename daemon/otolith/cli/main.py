@@ -271,18 +271,19 @@ def compile_command(file: Path) -> None:
     from otolith import kernel_cache
     from otolith.adaptation.state import initial_state
     from otolith.machine import load_machine
-    from otolith.runtime.worker import warm_up
+    from otolith.runtime.worker import WARM_UP_KERNELS, warm_up
     from otolith_drivers.errors import ServiceError, counted
     from otolith_drivers.user_dirs import cache_directory
 
     machine, begun = load_machine(file, with_driver=False), time.monotonic()
-    folder, count = cache_directory("kernels"), 0
+    folder, count, done = cache_directory("kernels"), 0, 0
     with progress_line(f"compiling {machine.twin.name}") as show:
 
         def observe(step: kernel_cache.CompileStep) -> None:
-            nonlocal count
-            count += step.compiled
-            show(f"compiling {step.kernel}, {counted(count, 'kernel')} done in {time.monotonic() - begun:.0f} s")
+            nonlocal count, done
+            count, done = count + step.compiled, done + (step.is_end and step.is_kernel)
+            took = f"{time.monotonic() - begun:.0f} s"
+            show(f"compiling {step.kernel}, {done} of {max(done, WARM_UP_KERNELS)} kernels done in {took}")
 
         identity = machine.file.machine
         with kernel_cache.observed(observe):

@@ -15,7 +15,18 @@ import zenoh
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
 from otolith.publishing.zenoh_config import ENCRYPTED, Access, Settings, Validity, listening
-from otolith.publishing.zenoh_session import ALIVE, EVENT, PARAMETER, REPORT, answer, close_session, prefix, session
+from otolith.publishing.zenoh_session import (
+    ALIVE,
+    EVENT,
+    PARAMETER,
+    REPORT,
+    START,
+    StartDocument,
+    answer,
+    close_session,
+    prefix,
+    session,
+)
 from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import NotValidNowError, OtolithError, ServiceError
@@ -80,6 +91,7 @@ class Publisher:
         self._site, self._machine, self._access, self._archive = site, machine, access, archive
         self._lock, self._closing, self._wake = threading.Lock(), threading.Event(), threading.Event()
         self._latest: str | None = None
+        self._start: str | None = None
         self._validity, self._warned_on = Validity(), date.min
         self._noticed: tuple[datetime | None, int] = (None, 0)  # End of validity, and days, of the last notice
         self._refused = ""  # Why files that were replaced cannot be used
@@ -124,6 +136,20 @@ class Publisher:
         """Let a thread take over certificates, passwords and readers of a changed machine file."""
         self._access = access
         self._wake.set()
+
+    def publish_start(self, document: StartDocument) -> None:
+        """Tell how far the daemon is that starts; a document that is done is the last one."""
+        text = document.json_line()
+        with self._lock:
+            self._start, sessions = text if document.done < document.total else None, self._sessions
+        for each in sessions:
+            key = START.under(self._site, self._machine)
+            each.opened.put(
+                key,
+                text,
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
 
     def outages(self, now: datetime) -> dict[str, str]:
         """Return the endpoints where nobody can connect, and why."""
@@ -245,6 +271,7 @@ class Publisher:
         declared = (
             opened.declare_queryable(key, self._answer, complete=True),
             opened.declare_queryable(EVENT.under(site, machine), self._answer_events, complete=True),
+            opened.declare_queryable(START.under(site, machine), self._answer_start, complete=True),
             opened.liveliness().declare_token(ALIVE.under(site, machine)),
         )
         with self._lock:
@@ -271,3 +298,9 @@ class Publisher:
     def _answer_events(self, query: zenoh.Query) -> None:
         with query:
             answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)
+
+    def _answer_start(self, query: zenoh.Query) -> None:
+        with self._lock:
+            start = self._start
+        with query:
+            answer(query, START.under(self._site, self._machine), "start", start, None)

@@ -12,7 +12,16 @@ from typing import Self
 import zenoh
 
 from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
-from otolith.publishing.zenoh_session import ALIVE, MAX_REPLIES, REPORT, Topic, close_session, session
+from otolith.publishing.zenoh_session import (
+    ALIVE,
+    MAX_REPLIES,
+    REPORT,
+    START,
+    StartDocument,
+    Topic,
+    close_session,
+    session,
+)
 from otolith_drivers.errors import ServiceError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -139,6 +148,7 @@ class Subscriber:
         self._endpoints = connection.endpoints
         self._settings = reader_settings(connection.credentials, connection.endpoints)
         self._sessions: dict[str, zenoh.Session] = {}
+        self._starts: dict[str, StartDocument] = {}  # By the key of the machine, until its first report
         self._declared: list[object] = []
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._connect, self._run)]
         for thread in self._threads:
@@ -149,9 +159,16 @@ class Subscriber:
         """Whether a daemon or a router is connected."""
         return any(each.info.peers_zid() or each.info.routers_zid() for each in tuple(self._sessions.values()))
 
+    @property
+    def starting(self) -> tuple[str, ...]:
+        """How far each daemon is that starts, in words."""
+        return tuple(f"{each.machine} ({each.site}): {each.text}" for each in tuple(self._starts.values()))
+
     def state(self) -> str:
         """Return what it waits for, in words."""
         addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
+        if self.connected and (starting := self.starting):
+            return "; ".join(starting)
         if self.connected:
             reports = REPORT.under(self._site, self._machine)
             return f"connected, no report yet; if none comes, this reader may not read {reports} ({addresses})"
@@ -190,7 +207,7 @@ class Subscriber:
                 self._declare(opened)
 
     def _declare(self, opened: zenoh.Session) -> None:
-        for topic in {REPORT, *self._topics}:  # a report also shows from where on events can be missing
+        for topic in {REPORT, START, *self._topics}:  # a report also shows from where on events can be missing
             self._declared.append(opened.declare_subscriber(topic.under(self._site, self._machine), self._receive))
         alive = ALIVE.under(self._site, self._machine)
         self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
@@ -202,6 +219,8 @@ class Subscriber:
     def _receive_alive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self._put(str(sample.key_expr), None)
+        else:
+            self._starts.pop(str(sample.key_expr).rpartition("/")[0], None)
 
     def _put(self, key: str, text: str | None) -> None:
         try:
@@ -226,11 +245,27 @@ class Subscriber:
                 self._begin_or_catch_up(key.rpartition("/")[0])
 
     def _take(self, key: str, text: str) -> None:
+        machine, _, topic_key = key.rpartition("/")
+        if topic_key == START.key:
+            self._take_start(machine, text)
+            return
+        self._starts.pop(machine, None)
         is_subscribed = any(key.endswith(f"/{topic.key}") for topic in self._topics)
         (self.order.take if is_subscribed else self.order.begin)(key, text)
 
+    def _take_start(self, machine: str, text: str) -> None:
+        try:
+            document = StartDocument.model_validate_json(text)
+        except ValueError:  # anybody may publish anything
+            return
+        self._starts.pop(machine, None)
+        if document.done < document.total and len(self._starts) < MAX_KEYS:
+            self._starts[machine] = document
+
     def _begin_or_catch_up(self, machine: str) -> None:
         """Take the latest report of a daemon that is new here, or what was published while it was not connected."""
+        for text in self._get(f"{machine}/{START.key}"):
+            self._take_start(machine, text)
         keys = [f"{machine}/{topic.key}" for topic in self._topics]
         if self._from_now and not set(keys) & set(self.order.keys):
             for text in self._get(f"{machine}/{REPORT.key}"):

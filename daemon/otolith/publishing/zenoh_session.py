@@ -26,6 +26,7 @@ from otolith.publishing.zenoh_config import (
     raise_descriptor_limit,
 )
 from otolith.storage.history_writer import HistoryWriter
+from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import ServiceError
 
 log = logging.getLogger(__name__)
@@ -114,9 +115,20 @@ class Topic:
 REPORT = Topic("report")  # JSON otolith.report/1, once per window; a query returns the latest, or what it selects
 PARAMETER = Topic("parameter/*")  # JSON object, once per window: the part of the report about one parameter
 EVENT = Topic("event")  # JSON, once when a window raises, changes or clears it; a query returns what it selects
+START = Topic("start")  # JSON, as a daemon that starts compiles kernels; a query returns how far it is until it is done
 ALIVE = Topic("alive")  # Liveliness token, while the daemon runs
 
-TOPICS = (REPORT, PARAMETER, EVENT, ALIVE)
+TOPICS = (REPORT, PARAMETER, EVENT, START, ALIVE)
+
+
+class StartDocument(DocumentModel):
+    """How far a daemon is that starts: until it has its kernels it reports nothing."""
+
+    site: str
+    machine: str
+    done: int  # Kernels that are compiled or loaded
+    total: int
+    text: str  # The same in words
 
 
 def prefix(site: str, machine: str) -> str:

@@ -43,12 +43,12 @@ from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
-from otolith.publishing.zenoh_session import protect_files
+from otolith.publishing.zenoh_session import StartDocument, protect_files
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
 from otolith.runtime.effort import Effort
 from otolith.runtime.process import SIGNALS, EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
+from otolith.runtime.worker import COMPILE_TIMEOUT, Preparation, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
@@ -205,6 +205,7 @@ class Service:
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
+        self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
         self._is_reload_due = False
         self._windows = self._windows_bad = self._progress = 0
@@ -365,9 +366,24 @@ class Service:
             self._publish(report, seconds)
             self._windower.records = self._supervisor.records
             self._save(time.monotonic())
+        self._show_preparation()
         self._feed_watchdog(time.monotonic())
         if self._recorder.is_enabled:
             self._recorder.poll(time.monotonic())
+
+    def _show_preparation(self) -> None:
+        """Tell readers and systemd how many kernels a worker has that is not ready: until then there is no report."""
+        if (now := self._supervisor.preparation) == self._preparation:
+            return
+        before, self._preparation = self._preparation, now
+        shown = now or before
+        if shown is None or self._publisher is None:
+            return
+        identity, done = self._machine.file.machine, shown.total if now is None else shown.done
+        self._notifier.send(f"STATUS={shown.text if now else 'the first window is computed'}")
+        self._publisher.publish_start(
+            StartDocument(site=identity.site, machine=identity.name, done=done, total=shown.total, text=shown.text)
+        )
 
     def _cut(self, now: float) -> None:
         self._follow_wall_clock()

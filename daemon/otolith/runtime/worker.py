@@ -32,6 +32,7 @@ WARM_UP_RECORDS = 40  # of the random window that makes a new worker compile eve
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
 WINDOW_TIMEOUT = 20.0  # s of effort for a window, in addition to twice its length
 COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
+WARM_UP_KERNELS = 11  # that a new worker compiles or loads
 NOT_READY = "the worker is starting; if the twin is new on this computer, it compiles kernels, which takes minutes"
 
 
@@ -99,6 +100,20 @@ def warm_up(state: AdaptationState) -> str:
     return perform(with_problem(state, short), window).failure
 
 
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """How far a worker that starts has come."""
+
+    done: int  # Kernels that are compiled or loaded
+    total: int
+    is_compiled: bool  # Whether one of them was compiled, and not loaded
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        return f"the daemon {'compiles' if self.is_compiled else 'loads'} kernels: {self.done} of {self.total}"
+
+
 class Supervisor:
     """Runs the worker process and keeps the adaptation state. Times are monotonic seconds, given by the caller."""
 
@@ -110,6 +125,7 @@ class Supervisor:
         self.finished = 0
         self.progress = 0  # Finished windows and compiled kernels
         self.is_compiling = True  # Whether the worker starts, or compiles or loads a kernel
+        self._prepared: list[bool] = []  # Of each kernel that a new worker has had, whether it was compiled
         self._is_ready = False
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._timeout = WINDOW_TIMEOUT + 2 * length
@@ -131,6 +147,14 @@ class Supervisor:
         return max(0, self.worker.starts - 1)
 
     @property
+    def preparation(self) -> Preparation | None:
+        """What a worker does that is not ready for a window yet; None if it is."""
+        if self._is_ready:
+            return None
+        total = max(WARM_UP_KERNELS, len(self._prepared))
+        return Preparation(len(self._prepared), total, any(self._prepared))
+
+    @property
     def _allowed_seconds(self) -> float:
         return self._timeout + (COMPILE_TIMEOUT if self.is_compiling else 0.0)
 
@@ -140,7 +164,7 @@ class Supervisor:
 
     def start(self) -> None:
         """Start the worker."""
-        self.is_compiling, self._is_ready = True, False
+        self.is_compiling, self._is_ready, self._prepared = True, False, []
         self.worker.start(self.state)
 
     def submit(self, window: Window, now: float) -> None:
@@ -178,9 +202,12 @@ class Supervisor:
         """Allow time from this step on. Loading a kernel is no progress: a worker that always dies loads some, too."""
         if isinstance(step, Ready):
             self._is_ready = True
-        elif step.compiled:
-            self.progress += 1
-            log.info("compiled kernel %s", step.kernel)
+        elif step.is_end:
+            self._prepared += [step.compiled] if step.is_kernel and not self._is_ready else []
+            self.progress += step.compiled
+            number = self.preparation
+            count = f", {number.done} of {number.total}" if step.is_kernel and number is not None else ""
+            log.log(logging.INFO if step.compiled else logging.DEBUG, "compiled %s%s", step.kernel, count)
         self.is_compiling = not self._is_ready or not (isinstance(step, Ready) or step.is_end)
         self._effort.begin(now, self.worker.processor_time)
 

@@ -69,13 +69,18 @@ class Reconnection:
         self.state, self.count = (False, "not opened yet"), 0  # Up or not, and why not: both change at once
         self.backoff = ReconnectBackoff()
         self._title, self._log = title, log
-        self._was_up, self._begun = False, 0.0
+        self._was_up, self._has_failed, self._begun = False, False, 0.0
         self._logged = ""  # the latest reason
 
     @property
     def up(self) -> bool:
         """Whether the other end answers."""
         return self.state[0]
+
+    @property
+    def has_failed_first(self) -> bool:
+        """Whether it was never up, and the first attempt has failed."""
+        return self._has_failed and not self._was_up
 
     @property
     def reason(self) -> str:
@@ -103,7 +108,7 @@ class Reconnection:
             self._log.warning("%s: %s; trying again until it works%s", self._title, reason, remark)
         if self.up and self._clock() - self._begun >= LASTING:
             self.backoff.reset()
-        self.state = False, reason
+        self._has_failed, self.state = True, (False, reason)
 
 
 @dataclass(slots=True)

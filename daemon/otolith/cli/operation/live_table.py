@@ -132,8 +132,11 @@ class _Grey:
 class LiveTable:
     """Takes reports from any thread, and draws itself; ``state`` returns what is waited for, in words."""
 
-    def __init__(self, state: Callable[[], str], *, details: bool = False) -> None:
-        self._state, self._details = state, details
+    def __init__(
+        self, state: Callable[[], str], *, details: bool = False, starting: Callable[[], Iterable[str]] = tuple
+    ) -> None:
+        """``starting`` returns how far each daemon is that has not reported yet."""
+        self._state, self._details, self._starting = state, details, starting
         self._lock = threading.Lock()
         self._machines: dict[tuple[str, str], _Machine] = {}
         self._unreadable = 0
@@ -171,6 +174,8 @@ class LiveTable:
                 for part in machine.draw(state, width, in_short=in_short, details=self._details)
             ]
             unreadable = self._unreadable
+        if parts:
+            parts += [Text(text, style="yellow") for text in self._starting()]
         if in_short:
             parts.append(Text("'otolith watch MACHINE' shows more of one machine", style="dim"))
         if unreadable:
@@ -400,7 +405,7 @@ def watch_reports(
             if as_json:
                 _stream(texts, subscriber, state, stopped)
                 return
-            table = LiveTable(state, details=details)
+            table = LiveTable(state, details=details, starting=lambda: subscriber.starting)
             with Live(table, console=Terminal(), refresh_per_second=5):
                 while not stopped():
                     for text in drain(texts, PAUSE):
