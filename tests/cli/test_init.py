@@ -75,6 +75,22 @@ def test_a_database_and_a_log_become_a_file_that_check_accepts(tmp_path: Path, s
     assert otolith("check", file, log).return_value == 0
 
 
+def test_a_database_alone_gives_proposals_that_are_marked(tmp_path: Path) -> None:
+    file = tmp_path / "drive.toml"
+    text = otolith("init", file, "--dbc", EXAMPLES / "dc-motor.dbc", "--no-bus", "--channel", "can3").output
+    signals = tables(file)["signals"]
+    assert {name: row["signal"] for name, row in signals.items()} == {
+        "V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed",
+    }  # fmt: skip
+    assert tables(file)["driver"]["channel"] == "can3"
+    assert tables(file)["window"]["sample_period"] == "10 ms"  # the cycle time of the database
+    lines = [line for line in file.read_text(encoding="utf-8").splitlines() if "signal = " in line]
+    assert all("confirm" in line for line in lines)
+    assert_says(text, "otolith check", "--last")
+    result = CliRunner().invoke(cli, ["init", str(tmp_path / "new.toml"), "--csv", "x.csv", "--no-bus"])
+    assert result.exit_code == 2
+
+
 def test_a_bus_without_a_torque_sensor_becomes_a_file_whose_signals_come(own_machine: OwnMachine) -> None:
     lines = own_machine.dbc.read_text(encoding="utf-8").splitlines(keepends=True)
     database = own_machine.machine.parent / "without-torque.dbc"

@@ -13,6 +13,7 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.canbus.probe import COUNTER_OR_CHECKSUM, Picture, can_driver_lines
 from otolith_drivers.errors import ConfigurationError, DeviceError, counted, some_names
+from otolith_drivers.grammars.toml_lines import toml_value
 from otolith_drivers.replay.can_log import frames_in
 from otolith_drivers.units import is_unit
 
@@ -48,9 +49,38 @@ def bus_offers(database: Path, bus: BusOptions, seconds: float, folder: Path, st
     offers = _offers(picture)
     if not offers:
         asked = f"no signal of {database} came in {seconds:g} s: is the machine on?"
-        raise DeviceError(f"CAN bus {bus.title()}: {asked} 'otolith probe can' shows what is on the bus")
+        remedy = "'otolith probe can' shows what is on the bus; --no-bus proposes from the database alone"
+        raise DeviceError(f"CAN bus {bus.title()}: {asked} {remedy}")
     driver = can_driver_lines(bus, picture, seen_from(database, folder))
     return OfferedSource(title, driver, offers, 0.0, remarks=_remarks(picture))
+
+
+def database_offers(database: Path, bus: BusOptions, folder: Path) -> OfferedSource:
+    """Return what a database describes, with nothing received; raise ConfigurationError if it has no signal."""
+    found = load_dbc(database)
+    rows = [
+        (message, signal)
+        for message in found.messages
+        for signal in message.signals
+        if signal.unit or not COUNTER_OR_CHECKSUM.search(signal.name)
+    ]
+    if not rows:
+        raise ConfigurationError(f"{database}: no signal beside counters and checksums")
+    names = Counter(signal.name for _, signal in rows)
+    offers = []
+    for message, signal in rows:
+        is_unique = names[signal.name] == 1
+        keys = {"signal": signal.name} | ({} if is_unique else {"message": message.name})
+        cycle = message.cycle_time if isinstance(message.cycle_time, int | float) and message.cycle_time > 0 else None
+        ends = [end for end in (signal.minimum, signal.maximum) if end is not None]
+        unit = signal.unit if signal.unit and is_unit(signal.unit) else None
+        interval = None if cycle is None else 1e-3 * float(cycle)
+        name = signal.name if is_unique else f"{message.name}.{signal.name}"
+        offers.append(Offer(name, unit, keys, np.array(ends if len(ends) == 2 else [], dtype=float), interval))
+    lines = [*can_driver_lines(bus, Picture(found), None), f"dbc = {toml_value(seen_from(database, folder))}"]
+    remark = "nothing was received: least and most are ranges of the database, and 'every' is its cycle time"
+    title = f"{database}: {counted(len(offers), 'signal')}"
+    return OfferedSource(title, lines, offers, 0.0, remarks=[remark], doubt="not received yet: confirm it")
 
 
 def _offers(picture: Picture) -> list[Offer]:

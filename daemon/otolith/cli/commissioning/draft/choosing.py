@@ -62,7 +62,7 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
     if hidden := [offer.name for offer in source.offers if offer not in writable]:
         echo(f"! no machine file can name {', '.join(hidden)}: rename what has control characters", "")
     proposal = _twin(offers, source, answers, questions)
-    signals, assumed = _signals(proposal, offers, answers, questions)
+    signals, assumed = _signals(proposal, offers, answers, questions, source.doubt)
     proposed = f"{1e3 * proposed_period([read.offer for read in signals.values()]):.6g} ms"
     period = questions.text("Sample period", answers.sample_period or proposed, _seconds).removesuffix(" s")
     length = proposed_length(float(period), source.duration)
@@ -122,7 +122,7 @@ def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
     for offer in offers[:MAX_SHOWN]:
         ends = [f"{end:.4g}" for end in (offer.values.min(), offer.values.max())] if len(offer.values) else ["", ""]
         every = "" if offer.interval is None else duration_text(offer.interval)
-        moves = "yes" if offer.moves else "·no"
+        moves = "?" if source.doubt else "yes" if offer.moves else "·no"
         rows.append({"signal": offer.name, "unit": offer.unit or "?", "least": ends[0], "most": ends[1],
                      "every": every, "moves": moves})  # fmt: skip
     console = stdout_console()
@@ -157,7 +157,7 @@ def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, ques
 
 
 def _signals(
-    proposal: TwinProposal, offers: Sequence[Offer], answers: Answers, questions: Questions
+    proposal: TwinProposal, offers: Sequence[Offer], answers: Answers, questions: Questions, doubt: str
 ) -> tuple[dict[str, ReadSignal], dict[str, str]]:
     """Return the signals that the source has, and the inputs that nothing measures with what is assumed of them."""
     known = {offer.name: offer for offer in offers}
@@ -180,6 +180,7 @@ def _signals(
             echo(f"  {what}: no sensor, taken as {text}")
             continue
         why = pair.why if pair and pair.offer.name == text else "as told"
+        why = f"{why}; {doubt}".removeprefix("; ").removesuffix("; ")
         others = proposal.others.get(name, ()) if pair and pair.offer.name == text else ()
         read[name] = _read(twin, name, known[text], why, answers, questions)
         echo(f"  {what}: {text} [{read[name].unit}], {read[name].remark}")

@@ -40,6 +40,7 @@ def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) 
 @click.option("--opcua", metavar="ENDPOINT", help="An OPC UA server.")
 @click.option("--mqtt", metavar="HOST[:PORT]", help="An MQTT broker.")
 @click.option("--log", type=FILE, help="A log of the CAN bus, as candump -L writes it, .blf, .asc, .trc, .mf4.")
+@click.option("--no-bus", is_flag=True, help="Do not listen to the CAN bus: propose from its database alone.")
 @click.option("--interface", default="auto", help="Of python-can: socketcan, pcan, kvaser, slcan ...")
 @click.option("--channel", help="As 'ip link' or python-can names it.  [default: vcan0]")
 @click.option("--port", type=click.IntRange(1024, 65535), default=43113, help="Of udp_multicast.")
@@ -82,6 +83,7 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
       otolith init drive.toml --csv montag.csv --unit Drehzahl=1/min --commission
       otolith init drive.toml --dbc drive.dbc --log monday.log
       otolith init drive.toml --dbc drive.dbc --channel can0
+      otolith init drive.toml --dbc drive.dbc --no-bus
       otolith init drive.toml --modbus 192.168.0.10 --ask
       otolith init drive.toml --opcua opc.tcp://plc:4840 --driver user=otolith
     """
@@ -107,8 +109,8 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
             "what is the source? --csv, --dbc (with --log or --channel), --modbus, --opcua or --mqtt"
         )
     target = str(options[kind] if given else click.prompt("its file or address"))
-    if options["log"] is not None and kind != "dbc":
-        raise click.UsageError("--log needs --dbc, the database of its frames")
+    if (options["log"] is not None or options["no_bus"]) and kind != "dbc":
+        raise click.UsageError("--log and --no-bus need --dbc, the database of the frames")
     stop = StopSignal()
     try:
         source = _source(kind, target, options, file.parent, stop)
@@ -144,7 +146,7 @@ def _source(kind: str, target: str, options: dict[str, Any], folder: Path, stop:
         from otolith.cli.commissioning.draft.recorded import table_offers
 
         return table_offers(Path(target), folder)
-    if log is None:
+    if log is None and not options["no_bus"]:
         echo(f"for {seconds:g} s: let the machine move")
     if kind == "dbc":
         return _can_source(Path(target), options, folder, stop)
@@ -159,7 +161,7 @@ def _source(kind: str, target: str, options: dict[str, Any], folder: Path, stop:
 
 
 def _can_source(database: Path, options: dict[str, Any], folder: Path, stop: StopSignal) -> "OfferedSource":
-    from otolith.cli.commissioning.draft.bus import bus_offers, log_offers
+    from otolith.cli.commissioning.draft.bus import bus_offers, database_offers, log_offers
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.config_files import validated
 
@@ -169,4 +171,6 @@ def _can_source(database: Path, options: dict[str, Any], folder: Path, stop: Sto
     bus = validated(keys, BusOptions, ())
     if options["log"] is not None:
         return log_offers(options["log"], database, bus, folder)
+    if options["no_bus"]:
+        return database_offers(database, bus, folder)
     return bus_offers(database, bus, options["seconds"], folder, stop)

@@ -47,6 +47,7 @@ class OfferedSource:
     duration: float  # s
     check: str = ""  # What 'otolith check' needs behind the machine file
     remarks: Sequence[str] = ()
+    doubt: str = ""  # What each proposal is in need of, as the source was not there
 
 
 def noise_level(values: Array) -> float | None:
