@@ -56,10 +56,15 @@ def motor() -> LoadedMachine:
 
 def simulated(situation: str, count: int = COUNT) -> list[Report]:
     """Return the reports of the first ``count`` windows of a situation."""
+    return reports_of(FAULTS[situation], count, SEED)
+
+
+def reports_of(fault: dict[str, Any], count: int, seed: int) -> list[Report]:
+    """Return the reports of the first ``count`` windows of the motor with a fault."""
     machine = motor()
     state = initial_state(MACHINE, SITE, machine.problem, machine.plan)
     reports = []
-    for index, window in enumerate(of_scenario("demo", FAULTS[situation], machine, SEED, count=count), 1):
+    for index, window in enumerate(of_scenario("demo", fault, machine, seed, count=count), 1):
         state, report = adapt(state, replace(window, start=START + window.start))
         counters = CountersDocument(received=index * window.records * len(machine.twin.signals), windows=index)
         reports.append(replace(report, document=report.document.model_copy(update={"counters": counters})))

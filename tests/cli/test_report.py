@@ -107,3 +107,18 @@ def test_a_document_that_cannot_be_read_is_named(written: Path) -> None:
     error = run(MACHINE).exception
     assert isinstance(error, ConfigurationError)
     assert "cannot be read" in str(error)
+
+
+def test_the_page_is_opened_in_the_browser_if_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+
+    def open_once(address: str) -> bool:
+        opened.append(address)
+        return len(opened) == 1
+
+    monkeypatch.setattr("webbrowser.open", open_once)
+    path = Path(run(MACHINE, "--open", "--output", "page.html").stdout.strip())
+    assert opened == [path.absolute().as_uri()]
+    assert "BROWSER" in run(MACHINE, "--open", "--output", "other.html").stderr
+    assert Path("other.html").exists()
+    assert isinstance(run(MACHINE, "--open", "--output", "-").exception, click.UsageError)

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.cli.main import TRANSPORTS, cli
+from otolith.cli.operation.history import report
 from otolith.publishing.zenoh_session import TOPICS
 from otolith_drivers.plant.realtime import NODES
 
@@ -125,3 +126,13 @@ def test_no_text_tells_to_install_otolith_from_an_index() -> None:
     }
     found = [path for path, lines in texts.items() for line in lines if wrong.search(line) and "--no-index" not in line]
     assert found == []
+
+
+def test_a_clone_is_at_most_five_commands_from_a_page_in_the_browser() -> None:
+    first = README.partition("## Your machine")[0]
+    commands = re.findall(r"^    ((?:make|\.venv/bin/otolith) .*)$", first, re.MULTILINE)
+    assert commands[0] == "make demo"
+    assert commands[-1].startswith(".venv/bin/otolith report dc-motor")
+    assert len(commands) <= 5
+    options = {option for row in report.params for option in row.opts}
+    assert set(re.findall(r"--\w+", commands[-1])) <= options

@@ -5,6 +5,7 @@ import math
 import re
 import sys
 import time
+import webbrowser
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
@@ -305,7 +306,8 @@ def _table(samples: "Sequence[HistorySample]", width: int, texts: "Texts") -> "R
 @click.option("--since", default="7d", callback=age_or_date, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
 @click.option("--output", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True), callback=new_file,
               metavar="FILE", help="Write this new file; '-' prints.  [default: MACHINE-TIME.html]")  # fmt: skip
-def report(machine: str, since: Since, output: Path | None) -> None:
+@click.option("--open", "opens", is_flag=True, help="Open it in the browser of this computer.")
+def report(machine: str, since: Since, output: Path | None, opens: bool) -> None:
     """Write what was estimated and announced as one HTML page.
 
     FILE is the machine file, MACHINE the name in it, with or without its site.
@@ -314,11 +316,13 @@ def report(machine: str, since: Since, output: Path | None) -> None:
 
     \b
     Examples:
-      otolith report press-3
+      otolith report press-3 --open
       otolith report my-machine.toml --since 30d
       otolith report press-3 --since 2026-01-31 --output press-3.html
       otolith report press-3 --since 1d --output - > /srv/www/press-3.html
     """
+    if opens and output == Path("-"):
+        raise click.UsageError("--open needs a file: give another --output than '-'")
     reader, now = reader_of(machine), time.time()
     end = end_of(reader)
     begin = since.before(end)
@@ -331,6 +335,8 @@ def report(machine: str, since: Since, output: Path | None) -> None:
     path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
     write_page(path, content)
     echo(path)
+    if opens and not webbrowser.open(path.absolute().as_uri()):
+        echo("no browser is known here: open the file where there is one, or set BROWSER", err=True)
 
 
 def page_of(reader: "HistoryReader", since: float, end: float) -> bytes:
