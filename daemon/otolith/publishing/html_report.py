@@ -24,7 +24,14 @@ from otolith.estimation.information import QUANTILE
 from otolith.health import text
 from otolith.health.conditions import ConditionPage, pages_of
 from otolith.health.limits import Level
-from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import (
+    ComponentDocument,
+    EventDocument,
+    ParameterDocument,
+    PartDocument,
+    ReportDocument,
+    Status,
+)
 from otolith.health.text import Texts, texts_in, zone_of
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
@@ -233,13 +240,21 @@ def _events(
 def _lanes(
     axis: Axis, latest: ReportDocument | None, states: Sequence[PartState]
 ) -> Iterator[tuple[str, Level, list[tuple[Level, float, float, float, float]]]]:
-    """Yield each part with its present state, and its states with position, length, begin and end."""
+    """Yield each part with its present state, and its states with position, length, begin and end.
+
+    A part outside the twin is in a report only while it is not well: it has a lane if it was in another state.
+    """
     health = latest.health if latest else None
-    for part, present in ({"": health, **health.parts} if health else {}).items():
+    named: dict[str, PartDocument | PartState] = {"": health, **health.parts} if health else {}
+    others: dict[str, PartDocument | PartState]
+    others = {row.part: row for row in states if named and row.part not in named}  # as each was last
+    for part, present in {**named, **others}.items():
         own = [(row.entered, row.state) for row in states if row.part == part]
-        yield part, present.state, [(state, *axis.span(begin, end), begin, end)
-                                    for begin, end, state in _pieces(own or [(present.since, present.state)], axis.now)
-                                    if end > axis.begin]  # fmt: skip
+        pieces = [(state, *axis.span(begin, end), begin, end)
+                  for begin, end, state in _pieces(own or [(present.since, present.state)], axis.now)
+                  if end > axis.begin]  # fmt: skip
+        if part in named or any(state is not Level.OK for state, *_ in pieces):
+            yield part, present.state, pieces
 
 
 def _pieces(entered: Sequence[tuple[float, Level]], now: float) -> Iterator[tuple[float, float, Level]]:
