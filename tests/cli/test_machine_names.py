@@ -116,7 +116,7 @@ def test_a_service_is_found_by_its_own_name_and_that_of_its_machine(machine_file
 
 def test_a_file_that_has_become_that_of_another_machine_is_not_taken(machine_file: Path) -> None:
     machine_file.write_text(FILE.replace(MACHINE, "other"), encoding="utf-8")
-    with raises_saying(ConfigurationError, MACHINE):
+    with raises_saying(ConfigurationError, MACHINE, "machine file", "give the file"):
         file_of(MACHINE)
 
 

@@ -142,6 +142,10 @@ def reader_of(text: str) -> "HistoryReader":
 def none_text(text: str, what: str) -> str:
     """Return that there is no ``what`` of a machine of this name, and which machines are known here."""
     known = sorted(set(_known_names()))
+    if any(text in {name, name.partition(".")[2]} for name in known):
+        return (
+            f"where the {what} of {text!r} is, is not known here, as its history is of a demo or a log: give the file"
+        )
     similar = nearest(text, known if "." in text else [name.partition(".")[2] for name in known])
     hint = f"{similar} " if known and not similar.startswith("known") else ""
     listed = f"known here: {some_names(known)}" if known else "none is known here"
@@ -190,7 +194,8 @@ def _single(text: str, found: dict[Found, MachineIdentity]) -> Found | None:
 
 def last_spoken(text: str = "*") -> Iterable[str]:
     """Yield when each machine of this user spoke last, in words; only that of the name ``text``, unless it is ``*``."""
-    from otolith.health.text import duration_text
+    from otolith.health.text import duration_text, zone_of
+    from otolith.health.times import clock_in
 
     for reader in own_histories():
         identity = MachineIdentity(reader.site, reader.machine)
@@ -201,5 +206,5 @@ def last_spoken(text: str = "*") -> Iterable[str]:
                 continue
             for report in reports:
                 end, name = report.window.end, identity.key
-                ago = duration_text(time.time() - end)
-                yield f"{name} spoke last at {common.local_time(end)}, {ago} ago: 'otolith report {name}' shows it"
+                when, ago = clock_in(zone_of(report))(end), duration_text(time.time() - end)
+                yield f"{name} spoke last at {when}, {ago} ago: 'otolith report {name}' shows it"
