@@ -128,6 +128,16 @@ def test_a_shelf_hides_nothing_that_is_worse(worn: Run, pause: int) -> None:
     assert worn.event.shelved is None  # once it was worse
 
 
+def test_a_diagnosis_of_which_alternatives_are_ruled_out_is_no_other_one(worn: Run) -> None:
+    worn.note(Deed.SHELVE, REASON, seconds=500.0 * LENGTH)
+    worn.windows(2, WORN)
+    (shelf,) = worn.state.shelves.values()
+    both = f"winding-hot {shelf.condition_id}"
+    worn.state = replace(worn.state, shelves={"limit/R_a": replace(shelf, condition_id=both)})
+    assert worn.windows(2, WORN) == []
+    assert worn.event.shelved is not None
+
+
 def test_a_shelf_hides_no_other_diagnosis(worn: Run) -> None:
     worn.note(Deed.SHELVE, REASON, seconds=500.0 * LENGTH)
     worn.windows(2, WORN)

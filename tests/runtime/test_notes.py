@@ -206,6 +206,8 @@ def test_a_wrong_argument_is_named(begin: Begin) -> None:
     person = begin(Computer())
     with raises_saying(ConfigurationError, "limit/R_b", "limit/R_a"):
         person.asks("acknowledge", "limit/R_b")
+    with raises_saying(ConfigurationError, "limit/R_a@", "not shelved"):
+        person.asks("unshelve", "limit/R_a")
     for arguments, parts in (
         (("shelve", "limit/R_a", "--for", "8d", "--reason", "x"), ("8d", "7d")),
         (("shelve", "limit/R_a", "--for", "1h", "--reason", " "), ("empty",)),

@@ -72,8 +72,8 @@ class Shelf:
 
     def hides(self, event: EventDocument, now: float) -> bool:
         """Whether an event of its condition is silent: not after its time, and nothing that is new or worse."""
-        is_same = event.state.rank <= self.state.rank and event.condition_id == self.condition_id
-        return is_same and self.lasts(now)
+        is_known = event.state.rank <= self.state.rank and _is_within(event.condition_id, self.condition_id)
+        return is_known and self.lasts(now)
 
     def lasts(self, now: float) -> bool:
         """Whether its time is not over."""
@@ -114,7 +114,12 @@ def noted(
 
 def _is_other(event: EventDocument, before: EventDocument) -> bool:
     """Whether an event is worse than ``before``, or has another diagnosis: nobody has seen that yet."""
-    return event.state.rank > before.state.rank or event.condition_id != before.condition_id
+    return event.state.rank > before.state.rank or not _is_within(event.condition_id, before.condition_id)
+
+
+def _is_within(condition_id: str, known: str) -> bool:
+    """Whether a diagnosis names no other condition than the ``known`` one: of alternatives some may be ruled out."""
+    return condition_id == known or set(condition_id.split()) <= set(known.split())
 
 
 def commented(event: EventDocument, note: NoteDocument) -> EventDocument:

@@ -229,8 +229,11 @@ def _do(
     note = OperatorNote(
         id=uuid.uuid4().hex, deed=Deed(deed), event=item.id, by=_person(by), at=now, text=text, seconds=seconds
     )
-    is_shelved = note.deed is Deed.UNSHELVE and _key(item) in known.shelves
-    if item.end is not None and note.deed is not Deed.COMMENT and not is_shelved:
+    waiting = (each for each in known.file.read().notes if each.deed is Deed.SHELVE and each.event == item.id)
+    is_shelved = item.shelved is not None or _key(item) in known.shelves or any(waiting)
+    if note.deed is Deed.UNSHELVE and not is_shelved:
+        raise ConfigurationError(f"event {item.id} is not shelved: 'otolith event list' shows what is")
+    if item.end is not None and note.deed in (Deed.ACKNOWLEDGE, Deed.SHELVE):
         end = local_time(known.labels.unix(item.end))
         raise ConfigurationError(f"event {item.id} ended at {end}: only 'otolith event comment' is possible")
 
