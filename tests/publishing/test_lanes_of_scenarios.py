@@ -99,7 +99,7 @@ def announced(documents: list[ReportDocument], part: str, at: float) -> Level | 
     return None if health is None else health.parts[part].state if part in health.parts else Level.OK
 
 
-@pytest.mark.parametrize("seed", often((1, 2), range(20)))
+@pytest.mark.parametrize("seed", often((2,), range(20)))
 def test_lanes_show_what_was_announced_and_that_is_what_happened(seed: int, tmp_path: Path) -> None:
     case = scenario(seed)
     reports = reports_of(case.fault, WINDOWS, seed)

@@ -10,6 +10,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
+from otolith.health.limits import Level
+from otolith.health.schema import EventChange
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing import certificates, publisher
 from otolith.publishing.certificates import (
@@ -23,10 +25,12 @@ from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access, Credentials
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import free_port
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 from tests.publishing.test_security import EXPECTED, Reader
+from tests.runtime.test_clock import Computer, Start, daemons
 from tests.waiting import wait_for
 
+__all__ = ["daemons"]  # a fixture
 OLD = timedelta(days=CERTIFICATE_DAYS - 20)  # since it was made: it is valid for 20 days
 
 
@@ -166,3 +170,24 @@ def test_a_folder_that_takes_no_file_leaves_the_old_pair_in_place(site: Path, mo
     with raises_saying(ConfigurationError, "no space"):
         keys("renew", site, "press")
     assert sorted(path.name for path in site.iterdir()) == before
+
+
+@pytest.mark.full
+def test_a_certificate_that_expires_soon_is_an_event_in_the_history_and_no_state(
+    site: Path, stack: ExitStack, daemons: Start
+) -> None:
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
+    publishing = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    running = daemons(Computer())
+    for name in ("warning", "expiry_notice", "warn_of_expiry"):
+        setattr(running, name, getattr(publishing, name))
+    running.run(3)
+    running.stop()
+    events = [event for event in running.reader.events(0.0) if event.condition_id == "certificate"]
+    (event,) = events  # once, although it is said in each report
+    assert (event.part, event.change, event.state) == ("daemon", EventChange.NOTED, Level.OK)
+    assert_says(event.text, "press.crt", f"{utc_now() + timedelta(days=20):%F}")
+    last = running.published[-1]
+    assert last.health is not None
+    assert last.health.state is Level.OK
+    assert any("press.crt" in note for note in last.notes)
