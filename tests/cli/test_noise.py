@@ -127,7 +127,7 @@ def test_the_spectrum_of_coloured_innovations_is_printed_before_and_after_inflat
         "#   power over that of white noise, from 0.5 Hz: 2.5 to 2 Hz, 0.9 to 50 Hz",
         "# innovations of i: white",
         "# innovations of omega: white",
-        "# process noise hides what the twin lacks, and may bias parameters: a replay without it names the causes",
+        "# process noise stands for what the twin lacks and may bias parameters: replay without it for the causes",
     ]
     slow = replace(noise, whiteness=after)  # what varies from window to window only is process noise
     assert not any("what the twin lacks" in line for line in noise_lines(machine, slow))

@@ -68,18 +68,17 @@ from otolith.twin.components import SourceKind
 from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
-DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
-UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
-SUSPECTED = (
-    "this window differs from the prediction: it may be a sudden change or an outlier, and the next windows decide"
+DISAGREEMENT = (
+    "the estimates of windows differ {:.1f} times more than their intervals allow: the twin or [noise] is off"
 )
+UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
 CHANGED = "something has changed"
 NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may be one that is not among them"
-NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
+NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves errors of {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the noise is not as large as [noise] or [process_noise] says"
 NOISE_SETTING = "if the machine is well, write what was found into [noise] or [process_noise]"
@@ -234,7 +233,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     decision, test = result.decision, result.test
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
-        reasons.append(SUSPECTED if decision is WindowDecision.SUSPECTED else decision.value)
+        reasons.append(decision.in_words)
     if test is not None and result.is_mixture:
         reasons.append(_hypotheses_text(test))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:

@@ -103,7 +103,7 @@ class ReplaySummary:
             yield Text(computing_time_text(median(self._seconds), max(self._seconds), length))
         for decision, count in self._decisions.items():
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
-                yield Text(f"  {count} good, but: {decision}", style="yellow")
+                yield Text(f"  {count} good, but: {decision.in_words}", style="yellow")
         for count, example in self._reasons.most_frequent():
             yield Text(f"  {count} bad like: {in_local_time(example, zone)}", style="red")
 

@@ -58,7 +58,7 @@ MAX_PLAUSIBLE_FACTOR = 10.0  # on process noise: beyond it, noise is hardly the 
 
 NEVER_MEASURED = "no window has a sample of it: its level is unchanged"
 CONSTANT = "the signal is constant, so its noise cannot be identified: its level is unchanged"
-UPPER_BOUND = "upper bound: beside the process noise, a better sensor would not be distinguishable"
+UPPER_BOUND = "upper bound: the process noise hides how much better the sensor may be"
 NOT_OBSERVABLE = "no output depends on it"
 AT_REST = "nothing moves in these windows, so its process noise cannot be identified"
 NOT_SIGNIFICANT = "not significant: up to about {:.1g} {} per square root of a second cannot be detected"

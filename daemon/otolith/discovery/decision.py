@@ -42,6 +42,25 @@ class WindowDecision(StrEnum):
     BAD = "the window is not good enough: it does not update the estimates"
     REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
 
+    @property
+    def in_words(self) -> str:
+        """What a person reads; the value is what programs read."""
+        return IN_WORDS.get(self, self.value)
+
+
+IN_WORDS = {
+    WindowDecision.SUSPECTED: (
+        "this window differs from the prediction: it may be a sudden change or an outlier, and the next windows decide"
+    ),
+    WindowDecision.STEPPED: "two windows show the same sudden change",
+    WindowDecision.DISCOVERED: "several windows show the same new component",
+    WindowDecision.NOISIER: "several windows show other noise than is stated",
+    WindowDecision.AMBIGUOUS: (
+        "several hypotheses explain the windows equally well: estimated is what they have in common"
+    ),
+}
+"""What people read where the value, which programs read, has to be read twice."""
+
 
 class PosteriorUpdate(Enum):
     """How a window changes the posterior."""

@@ -243,7 +243,7 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
                 bands = (f"{band.ratio:.2g} to {band.high:.3g} Hz" for band in row.bands)
                 yield f"#   power over that of white noise, from {row.bands[0].low:.3g} Hz: {', '.join(bands)}"
     if inflated and not all(row.is_white for row in identified.whiteness):
-        yield "# process noise hides what the twin lacks, and may bias parameters: a replay without it names the causes"
+        yield "# process noise stands for what the twin lacks and may bias parameters: replay without it for the causes"
 
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
@@ -263,7 +263,7 @@ def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") 
     if structure:
         yield "# the twin lacks it in all windows alike, and the process noise above contains it"
     if any(item.is_offered for item in structure):
-        yield "# otolith commission asks whether it belongs to the healthy machine, and identifies the noise beside it"
+        yield "# otolith commission asks whether it belongs to the healthy machine, and identifies the noise without it"
 
 
 def _inner_meaning(item: "Structure") -> str:

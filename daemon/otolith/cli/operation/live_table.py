@@ -94,7 +94,7 @@ class _Machine:
         """
         document, silence = self.document, time.monotonic() - self.received
         texts = texts_of(document)
-        times = {"time": clock_in(zone_of(document))(document.window.end), "duration": duration_text(silence)}
+        times = {"time": clock_in(zone_of(document))(document.window.end), "duration": duration_text(round(silence))}
         is_silent = silence > SILENT_WINDOWS * (document.window.end - document.window.start)
         age = "" if is_silent else f", {texts('age', **times)}"
         head = [title(document, age)] if in_short else []
