@@ -184,9 +184,12 @@ class Scale:
         return next(shown), next(shown)
 
 
-def scale_of(value: float, unit: str) -> Scale:
-    """Return how a number of the size of ``value`` is written in a ``unit`` of a file."""
-    symbol, size = unit_text(unit), abs(value)
+def scale_of(value: float, unit: str, half: float | None = None) -> Scale:
+    """Return how a number of the size of ``value`` is written in a ``unit`` of a file.
+
+    With ``half`` of its interval that of the larger of both: an interval around zero needs no prefix of its own.
+    """
+    symbol, size = unit_text(unit), max(abs(value), half or 0.0)
     prefixes = next((table for pattern, table in PREFIXED.items() if re.match(pattern, symbol)), None)
     low, high = PLAIN_NUMBERS if prefixes is None else PLAIN_QUANTITIES
     if not 0.0 < size < math.inf or low <= size < high:
@@ -204,7 +207,7 @@ def quantity_text(value: float, unit: str, half: float | None = None, digits: in
     ``4.681 ± 0.041 mN·m``: both are rounded to two digits of the interval. Without one, or with one of 0, the value has
     at most ``digits`` significant digits.
     """
-    scale = scale_of(max(abs(value), half or 0.0), unit)
+    scale = scale_of(value, unit, half)
     numbers = (scale.number(value, digits),) if half is None else scale.numbers(value, half)
     return " ".join(filter(None, (" ± ".join(numbers), scale.unit)))
 

@@ -1,5 +1,7 @@
 """An output of the daemon that does not work is an event of the daemon: the machine is judged as before."""
 
+from dataclasses import replace
+
 import pytest
 
 from otolith.discovery.decision import WindowDecision
@@ -7,7 +9,8 @@ from otolith.health.events import HealthState
 from otolith.health.limits import Level
 from otolith.health.observations import DAEMON, PERSISTENT_WINDOWS
 from otolith.health.schema import EventChange, FindingKind, ReportDocument
-from tests.health.test_events import SENSOR, assessed, changes, report
+from otolith.machine import load_rules
+from tests.health.test_events import PLAN, SENSOR, assessed, changes, report
 
 REASON = "/var/lib/otolith: cannot be created: Read-only file system"
 
@@ -38,6 +41,13 @@ def test_an_outage_is_one_event_until_it_is_over_whatever_the_machine_does(decis
     assert health is not None
     assert health.parts["winding"].state is not Level.WATCH
     assert health.parts[DAEMON].state is Level.WATCH
+
+
+def test_a_german_operator_reads_german() -> None:
+    plan = replace(PLAN, language="de", rules=load_rules("de"))
+    last = assessed([with_outages(report(index), "recording") for index in range(5)], plan=plan)[-1]
+    (event,) = last.open_events
+    assert event.text == "Aufzeichnung: /var/lib/otolith: kann nicht angelegt werden: Read-only file system"
 
 
 def test_a_day_on_which_everything_works_has_no_part_for_it() -> None:

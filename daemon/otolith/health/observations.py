@@ -1,6 +1,6 @@
 """What the report of a window shows about each condition of the machine, before any persistence."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from otolith.discovery.decision import Approval, WindowDecision
@@ -91,7 +91,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     reasons = "; ".join(report.window.quality.reasons) or next(held, "")  # where values, not times, are unusable
     no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons)
     observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
-    observations += _of_outputs(report, before)
+    observations += _of_outputs(report, before, plan.texts.translated)
     if report.decision is WindowDecision.REFUSED:
         features = FindingFeatures(FindingKind.UNEXPLAINED, report.twin)
         text = plan.texts.translated(report.decision)
@@ -121,9 +121,13 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
         yield Observation(key, BUS, level if key in absent else Level.OK, features, absent.get(key, ""))
 
 
-def _of_outputs(report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
+def _of_outputs(
+    report: ReportDocument, before: Mapping[str, Level], say: Callable[[str], str]
+) -> Iterator[Observation]:
     """Yield the outputs that do not work, and those that did not; the machine itself may be well."""
-    outages = {f"{OUTPUT}{name}": f"{name}: {reason}" for name, reason in (report.window.outages or {}).items()}
+    outages = {
+        f"{OUTPUT}{name}": f"{say(name)}: {say(reason)}" for name, reason in (report.window.outages or {}).items()
+    }
     for key in sorted(outages.keys() | {key for key in before if key.startswith(OUTPUT)}):
         features = FindingFeatures(FindingKind.NO_OUTPUT, subject=key.removeprefix(OUTPUT))
         yield Observation(key, DAEMON, Level.WATCH if key in outages else Level.OK, features, outages.get(key, ""))

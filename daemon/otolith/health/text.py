@@ -127,7 +127,7 @@ def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
     change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
     change = "0.00%" if change in ("-0.00%", "+0.00%") else change
     half = QUANTILE * parameter.sd
-    scale = scale_of(max(abs(parameter.value), half), parameter.unit)
+    scale = scale_of(parameter.value, parameter.unit, half)
     return *scale.numbers(parameter.value, half), scale.unit, change
 
 

@@ -299,10 +299,8 @@ def _curves(
 def _scale(parameter: ParameterDocument | None, samples: Sequence[HistorySample]) -> Scale:
     """Return how the numbers of a curve are written, by its present value; by its nominal value if it has none."""
     if parameter is not None:
-        half = QUANTILE * (parameter.sd or 0.0)
-        return scale_of(
-            parameter.nominal if parameter.value is None else max(abs(parameter.value), half), parameter.unit
-        )
+        size, sd = (parameter.nominal, 0.0) if parameter.value is None else (parameter.value, parameter.sd or 0.0)
+        return scale_of(size, parameter.unit, QUANTILE * sd)
     return scale_of(samples[-1].last, samples[-1].unit) if samples else Scale(0, "")
 
 

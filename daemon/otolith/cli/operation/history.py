@@ -295,7 +295,7 @@ def _table(samples: "Sequence[HistorySample]", width: int, texts: "Texts") -> "R
         reach = None if end.low is None or end.high is None else 0.5 * (end.high - end.low)
         change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
-        scale = scale_of(max(abs(end.last), reach or 0.0), unit)
+        scale = scale_of(end.last, unit, reach)
         limits = (scale.number(low), scale.number(high)) if has_range else ()
         table.add_row(name, *scale.numbers(end.last, reach), scale.unit, change, *limits, curve)
     return table
