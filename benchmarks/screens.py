@@ -175,12 +175,17 @@ def page_pictures(tab: Browser, pages: dict[str, str], folder: Path) -> Iterator
 def terminals(run: Story, german: Story) -> dict[str, str]:
     """Return the SVG of each terminal by its name."""
     end, undecided = run.until("end"), run.until("undecided")
-    shown = {f"watch-{width}": (watched(end), width, "otolith watch") for width in WIDTHS}
-    shown |= {f"watch-undecided-{width}": (watched(undecided), width, "otolith watch") for width in (60, 80)}
-    shown["watch-healthy-80"] = watched(run.until("healthy")), 80, "otolith watch"
-    shown["watch-details-120"] = watched(undecided, details=True), 120, "otolith watch --details"
-    shown["watch-german-80"] = watched(german.until("end")), 80, "otolith watch"
-    return {name: svg(*row) for name, row in shown.items()}
+    shown = {f"watch-{width}": (end, width) for width in WIDTHS}
+    shown |= {f"watch-undecided-{width}": (undecided, width) for width in (60, 80)}
+    shown |= {"watch-healthy-80": (run.until("healthy"), 80), "watch-details-120": (undecided, 120)}
+    shown |= {"watch-german-80": (german.until("end"), 80), "demo": (end, 120)}  # the last one is of the README
+    pictures = {}
+    with mock.patch("time.monotonic", return_value=0.0):  # each report has just come
+        for name, (documents, width) in shown.items():
+            details = "details" in name
+            table, title = watched(documents, details=details), f"otolith watch{' --details' if details else ''}"
+            pictures[name] = svg(table, width, title)
+    return pictures
 
 
 def document_of(texts: dict[str, str]) -> str:
@@ -226,7 +231,6 @@ def main() -> None:
         run, german = (story(folder / language, language) for language in ("en", "de"))
         for key, text in terminals(run, german).items():
             (pictures / f"{key}.svg").write_text(text, encoding="utf-8")
-        (pictures / "demo.svg").write_text(svg(watched(run.until("end")), 120, "otolith watch"), encoding="utf-8")
         undecided = replace(run, reports=run.reports[: len(run.until("undecided"))])
         stories = {"page": run, "page-undecided": undecided, "page-german": german}
         histories = {}
