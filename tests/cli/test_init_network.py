@@ -54,6 +54,37 @@ def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tm
         otolith("init", tmp_path / "other.toml", "--modbus", target, "--registers", "10..12", "--seconds", 1.5)
 
 
+def test_values_off_the_display_say_which_register_is_what(tmp_path: Path) -> None:
+    """Of a drive without a manual that runs at a steady speed: a voltage in 0.1 V, a current in mA, a speed in rpm."""
+    moments = count()
+
+    def steady() -> Words:
+        ripple = (-1.0) ** next(moments)
+        numbers = (241.0 + ripple, 2310.0 - 2 * ripple, 1449.0 + ripple, 377.0 + ripple)
+        return {10 + at: registers(round(number), "int16", "ABCD")[0] for at, number in enumerate(numbers)}
+
+    file = tmp_path / "drive.toml"
+    with library_server(steady(), lambda _: steady()) as port:
+        read = ["--modbus", f"127.0.0.1:{port}", "--registers", "10..13", "--seconds", 1.5]
+        shown = ["--display", "V_a=24,1 V", "--display", "i=2.31 A", "--display", "omega=1450 rpm"]
+        otolith("init", file, *read, *shown)
+        assert otolith("check", file).return_value == 0
+        for wrong, words in {
+            "omega=8000 rpm": ("omega", "8000", "--registers"),
+            "omega=1450 V": ("omega", "V"),
+            "omega=0 rpm": ("omega", "zero"),
+            "omega=fast": ("omega", "fast"),
+            "speed=1450 rpm": ("speed",),
+        }.items():
+            with raises_saying(ConfigurationError, *words):
+                otolith("init", tmp_path / "other.toml", *read, *shown[:4], "--display", wrong)
+    signals = tables(file)["signals"]
+    assert tables(file)["twin"]["name"] == "dc_motor"
+    assert signals["V_a"] == {"register": 10, "type": "int16", "unit": "V", "scale": 0.1}
+    assert signals["i"] == {"register": 11, "type": "int16", "unit": "A", "scale": 0.001}
+    assert signals["omega"] == {"register": 12, "type": "int16", "unit": "rpm", "scale": 1.0}
+
+
 def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     browsed = []
 

@@ -3,10 +3,12 @@
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
+from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, rank
+from otolith.cli.commissioning.draft.displays import with_displays
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
 from otolith.cli.commissioning.draft.questions import Questions
 from otolith.cli.commissioning.draft.writing import (
@@ -34,22 +36,6 @@ ASSUMPTIONS = [kind.value for kind in Assumption if kind is not Assumption.PROPO
 MAX_SHOWN = 40  # rows of the table of offers
 
 
-@dataclass(frozen=True, slots=True)
-class Answers:
-    """What options have answered."""
-
-    twin: str | None = None
-    signals: Mapping[str, str] = field(default_factory=dict)
-    unknown: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    scales: Mapping[str, str] = field(default_factory=dict)
-    noises: Mapping[str, str] = field(default_factory=dict)
-    name: str | None = None
-    site: str | None = None
-    sample_period: str | None = None
-    window: str | None = None
-
-
 def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: Questions) -> None:
     """Show what ``source`` offers, choose, ask, and write ``file``.
 
@@ -57,6 +43,7 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
         ConfigurationError: no twin fits, or an answer is none.
     """
     writable = [offer for offer in source.offers if not CONTROL.search(offer.name)]
+    answers = with_displays(answers, writable, [find_twin(name) for name in library_twins()])
     offers = with_units(writable, answers.units)
     _show(source, offers)
     if hidden := [offer.name for offer in source.offers if offer not in writable]:

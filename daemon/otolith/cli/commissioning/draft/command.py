@@ -14,7 +14,7 @@ from otolith.cli.common import FILE, StopSignal
 from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
-    from otolith.cli.commissioning.draft.choosing import Answers
+    from otolith.cli.commissioning.draft.answers import Answers
     from otolith.cli.commissioning.draft.offers import OfferedSource
 
 OF_THE_SOURCE = ("units", "scales")  # options by the names of the source, which may be any text
@@ -60,6 +60,8 @@ def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) 
               help="Unit of a signal of the source.")  # fmt: skip
 @click.option("--scale", "scales", multiple=True, callback=_pairs, metavar="NAME=FACTOR",
               help="What one step of a number is worth in its unit; not for --csv.")  # fmt: skip
+@click.option("--display", "displays", multiple=True, callback=_pairs, metavar="SIGNAL=VALUE",
+              help='Of Modbus: what the display of the drive shows meanwhile, as "omega=1450 rpm".')  # fmt: skip
 @click.option("--noise", "noises", multiple=True, callback=_pairs, metavar="SIGNAL=LEVEL",
               help='Standard deviation of a sensor, as "i=5 mA".')  # fmt: skip
 @click.option("--name", help="Of the machine.  [default: that of FILE]")
@@ -84,10 +86,11 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
       otolith init drive.toml --dbc drive.dbc --log monday.log
       otolith init drive.toml --dbc drive.dbc --channel can0
       otolith init drive.toml --dbc drive.dbc --no-bus
-      otolith init drive.toml --modbus 192.168.0.10 --ask
+      otolith init drive.toml --modbus 192.168.0.10 --display "omega=1450 rpm" \\
+        --display "i=2.3 A" --display "V_a=24 V"
       otolith init drive.toml --opcua opc.tcp://plc:4840 --driver user=otolith
     """
-    from otolith.cli.commissioning.draft.choosing import Answers
+    from otolith.cli.commissioning.draft.answers import Answers
     from otolith_drivers.errors import OtolithError
 
     if file.suffix != ".toml":
@@ -109,8 +112,7 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
             "what is the source? --csv, --dbc (with --log or --channel), --modbus, --opcua or --mqtt"
         )
     target = str(options[kind] if given else click.prompt("its file or address"))
-    if (options["log"] is not None or options["no_bus"]) and kind != "dbc":
-        raise click.UsageError("--log and --no-bus need --dbc, the database of the frames")
+    _check_options(kind, options, answers)
     stop = StopSignal()
     try:
         source = _source(kind, target, options, file.parent, stop)
@@ -122,6 +124,14 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
     stop.release()
     _finish(file, source, answers, questions, commissions=commissions)
     return 0
+
+
+def _check_options(kind: str, options: dict[str, Any], answers: "Answers") -> None:
+    """Raise UsageError for an option that is not of the ``kind`` of source."""
+    if (options["log"] is not None or options["no_bus"]) and kind != "dbc":
+        raise click.UsageError("--log and --no-bus need --dbc, the database of the frames")
+    if answers.displays and kind != "modbus":
+        raise click.UsageError("--display is for registers of --modbus; --signal and --unit tell it of other sources")
 
 
 def _finish(

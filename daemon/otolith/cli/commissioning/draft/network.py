@@ -67,7 +67,8 @@ def device_offers(
     ]
     title = f"{options.title()}, device {device}: {counted(len(offers), 'number')} that change"
     remark = (
-        "registers have neither names nor units: --signal SIGNAL=REGISTER, --unit REGISTER=UNIT and --scale say them"
+        "registers have neither names nor units: read the display of the drive, and give --display SIGNAL=VALUE; "
+        "or --signal SIGNAL=REGISTER, --unit REGISTER=UNIT and --scale, from a manual"
     )
     return OfferedSource(title, lines, offers, 0.0, remarks=[remark])
 

@@ -1,0 +1,104 @@
+"""Which register is which signal, and what a step of it is worth, from what the display of a drive shows meanwhile.
+
+Registers have neither names nor units. Drives scale them by powers of ten, so that a number off the display, times one
+of these, is what the register holds.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from otolith.cli.commissioning.draft.answers import Answers
+from otolith.cli.commissioning.draft.offers import Offer
+from otolith.cli.terminal import echo
+from otolith.twin.definition import Definition
+from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.units import factor
+
+# Engineering choices: docs/reference/thresholds-cli.md.
+POWERS = range(-5, 4)  # of ten, by which a drive scales a register
+CLOSE = 0.05  # of the displayed value: how far a register may be from it
+AS_CLOSE = 0.01  # of the displayed value: registers that differ by less are both named
+UNLIKELY = 1e6  # distance of what cannot be the same
+
+
+def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Definition]) -> Answers:
+    """Return the answers with twin, signals, units and scales that follow from displayed values; told ones stay.
+
+    Raises:
+        ConfigurationError: a value is none, or no register can have it.
+    """
+    if not answers.displays:
+        return answers
+    twin = _twin_of(answers, twins)
+    shown = {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
+    names = [name for name in shown if name not in answers.signals]
+    distances = np.array([[_distance(shown[name][0], offer) for offer in offers] for name in names])
+    signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
+    for at, place in zip(*linear_sum_assignment(distances.reshape(len(names), len(offers))), strict=True):
+        name, offer = names[at], offers[int(place)]
+        value, unit = shown[name]
+        if distances[at, place] > CLOSE:
+            held = ", ".join(f"{row.name}: {float(np.median(row.values)):.5g}" for row in offers)
+            fault = f"--display {name}: no register holds {value:g} times a power of ten ({held})"
+            remedy = "let the machine run steadily and read the display again, or choose others by --registers"
+            raise ConfigurationError(f"{fault}: {remedy}")
+        power = _power(value, offer)
+        signals[name], units[offer.name] = offer.name, units.get(offer.name, unit)
+        scales.setdefault(offer.name, f"{10.0**power:g}")
+        echo(f"{name}: {value:g} {unit} is {float(np.median(offer.values)):.5g}·10^{power} in register {offer.name}")
+        equal = distances[at] <= distances[at, place] + AS_CLOSE
+        if others := [row.name for row, is_equal in zip(offers, equal, strict=True) if is_equal and row is not offer]:
+            remedy = f"another speed or load decides, or --signal {name}=REGISTER"
+            echo(f"! {', '.join(others)} would fit {name} as well: {remedy}")
+    return replace(answers, twin=twin.name, signals=signals, units=units, scales=scales)
+
+
+def _twin_of(answers: Answers, twins: Sequence[Definition]) -> Definition:
+    """Return the twin that was told, or the one that lacks the fewest inputs of those with all outputs displayed."""
+    names = answers.displays.keys() | answers.signals.keys()
+    if answers.twin is not None:
+        fitting = [twin for twin in twins if twin.name == answers.twin]
+    else:
+        fitting = [twin for twin in twins if {row.name for row in twin.outputs} <= names <= set(twin.signals)]
+    if not fitting:
+        known = ", ".join(f"{twin.name}: {', '.join(twin.signals)}" for twin in twins)
+        raise ConfigurationError(
+            f"--display {', '.join(sorted(names))}: no twin has these outputs; signals are {known}"
+        )
+    return min(fitting, key=lambda twin: (len(twin.signals), len(twin.parameters)))
+
+
+def _quantity(twin: Definition, name: str, text: str) -> tuple[float, str]:
+    """Return number and unit of a displayed value; raise ConfigurationError if it is none of that signal."""
+    if name not in twin.signals:
+        raise ConfigurationError(f"--display {name}={text}: twin {twin.name}: {nearest(name, list(twin.signals))}")
+    number, _, unit = text.strip().partition(" ")
+    try:
+        value = float(number.replace(",", "."))
+        factor(unit, twin.unit_of(name))
+    except ValueError as error:
+        remedy = f'write it as --display "{name}=12.5 {twin.unit_of(name)}"'
+        raise ConfigurationError(f"--display {name}={text}: {error}: {remedy}") from error
+    if not math.isfinite(value) or value == 0.0:
+        raise ConfigurationError(f"--display {name}={text}: a value of zero shows no scale: let the machine run")
+    return value, unit
+
+
+def _power(value: float, offer: Offer) -> int:
+    return min(POWERS, key=lambda power: _distance_at(value, offer, power))
+
+
+def _distance(value: float, offer: Offer) -> float:
+    """Return how far a displayed value is from what a register holds, in shares of it, at the best power of ten."""
+    return min((_distance_at(value, offer, power) for power in POWERS), default=UNLIKELY)
+
+
+def _distance_at(value: float, offer: Offer, power: int) -> float:
+    if not len(offer.values):
+        return UNLIKELY
+    held = 10.0**power * float(np.median(offer.values))
+    return min(abs(held / value - 1.0), UNLIKELY)
