@@ -39,6 +39,7 @@ def german(path: Path, scenario: MotorScenario, heading: str, rows: int = ROWS, 
     return path
 
 
+NO_UNIT_OF_SPEED = "Zeit;U_A in V;I_A in A;Istdrehzahl;Temperatur;Bemerkung"
 UNITS_IN_A_LINE = "Zeit;Ankerspannung;Ankerstrom;Drehzahl;Gehäusetemperatur;Bemerkung\ns;V;A;1/min;°C;"
 UNITS_IN_THE_HEADER = "Zeit [s];U_A [V];I_A [A];Drehzahl Ist [U/min];Gehäuse [°C];Bemerkung"
 
@@ -63,6 +64,26 @@ def test_a_german_table_becomes_a_file_that_check_accepts(
     assert otolith("check", "--no-device", file).return_value == 0
     assert otolith("check", file, data).return_value == 0
     assert f"next: otolith commission '{file}' {data} --write" in text.splitlines()
+
+
+def test_a_speed_without_a_unit_is_in_that_of_drives_and_marked(tmp_path: Path, scenario: MotorScenario) -> None:
+    data, file = german(tmp_path / "montag.csv", scenario, NO_UNIT_OF_SPEED), tmp_path / "drive.toml"
+    text = otolith("init", file, "--csv", data).output
+    assert tables(file)["signals"]["omega"] == {"column": "Istdrehzahl", "unit": "1/min"}
+    assert tables(file)["signals"]["i"] == {"column": "I_A in A", "unit": "A"}
+    assert_says(text, "--unit Istdrehzahl=UNIT")
+
+
+def test_a_table_with_date_and_time_apart_becomes_a_file(tmp_path: Path, scenario: MotorScenario) -> None:
+    data = german(tmp_path / "montag.csv", scenario, "Uhrzeit;U_A [V];I_A [A];Drehzahl [1/min];Temp;Datum")
+    lines = data.read_text(encoding="cp1252").split("\n")
+    for number, line in enumerate(lines):
+        if line.endswith("läuft"):
+            seconds, *rest, _ = line.split(";")
+            lines[number] = ";".join([f"06:00:{float(seconds.replace(',', '.')):06.3f}", *rest, "23.11.2026"])
+    data.write_text("\n".join(lines), encoding="cp1252")
+    text = otolith("init", tmp_path / "drive.toml", "--csv", data).output
+    assert_says(text, f"{ROWS} rows in {0.01 * (ROWS - 1):.6g} s")
 
 
 def test_a_database_and_a_log_become_a_file_that_check_accepts(tmp_path: Path, scenario: MotorScenario) -> None:

@@ -11,11 +11,10 @@ import codecs
 import contextlib
 import csv
 import io
-import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, tzinfo
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -25,12 +24,12 @@ import pyarrow.compute as pc
 
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
-from otolith_drivers.common.message_times import unix_time
 from otolith_drivers.common.time_zones import zone_named
 from otolith_drivers.config_files import Range, StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows, seen
+from otolith_drivers.replay.table_dates import date_column, date_of, with_dates
 from otolith_drivers.units import factor, is_unit
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)
@@ -53,7 +52,6 @@ DATE = "2026-03-29T01:59:58.25Z"  # an example
 MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
 MIN_GROUPED = 10  # cells like 1.001, and whole numbers, from which on it is asked whether thousands are separated
 MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
-DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
@@ -122,6 +120,7 @@ class Header:
     others: tuple[tuple[str, int, str | None], ...] = ()
     """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
     beside: tuple[list[str], ...] = ()  # Cells of the lines that may have units: some below it, and the one above
+    date: int | None = None  # Position of the column of the date, if that of the time has the time of day only
 
 
 @dataclass(slots=True)
@@ -319,7 +318,8 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     is_wanted = SEGMENT in {request.column for request in wanted.values()}
     segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
     widths, below = (named, len(cells)), "".join(rows[skipped:])
-    return Header(path, number + skipped, sign, widths, columns, segment, below, others, (*split, above))
+    date = date_column([_name_and_unit(cell)[0] for cell in cells], split, places[TIME][0])
+    return Header(path, number + skipped, sign, widths, columns, segment, below, others, (*split, above), date)
 
 
 def _places(
@@ -432,6 +432,8 @@ class _TableChunk:
         kept = np.flatnonzero(self._right_width(cells))
         cells = cells if len(kept) == len(cells) else cells.take(pa.array(kept))
         texts = {name: pc.list_element(cells, column.place) for name, column in columns.items()}
+        if self._header.date is not None:
+            texts[TIME] = with_dates(pc.list_element(cells, self._header.date), texts[TIME])
         signs = (_decimal_sign([text for name, text in texts.items() if name != TIME]), _decimal_sign([texts[TIME]]))
         if not counts.decimal and (cell := _ambiguous_cell([text for name, text in texts.items() if name != TIME])):
             whole = cell.replace(".", "").replace(",", "")
@@ -440,7 +442,7 @@ class _TableChunk:
         counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
         times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
         dates = np.flatnonzero(np.isinf(times))
-        times[dates] = [_date(text, self._zone) for text in texts[TIME].take(pa.array(dates)).to_pylist()]
+        times[dates] = [date_of(text, self._zone) for text in texts[TIME].take(pa.array(dates)).to_pylist()]
         timed = self._timed(times, texts.pop(TIME), cells, kept)
         kept = kept[timed]
         if not len(kept):
@@ -584,10 +586,3 @@ def _numbers(texts: pa.StringArray, decimal: str) -> Array:
 def _other_sign(text: str, decimal: str) -> str:
     """A clause for a cell that is a number but for its decimal sign."""
     return f", but {decimal!r} is the decimal sign of other cells" if decimal and is_number(text) else ""
-
-
-def _date(text: str, zone: tzinfo) -> float:
-    """The Unix time (s) of a date, in ``zone`` if it names none; infinity for another text."""
-    with contextlib.suppress(ValueError):
-        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")), zone)
-    return math.inf

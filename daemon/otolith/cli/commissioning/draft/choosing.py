@@ -11,6 +11,7 @@ from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, ra
 from otolith.cli.commissioning.draft.displays import with_displays
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
 from otolith.cli.commissioning.draft.questions import Questions
+from otolith.cli.commissioning.draft.words import usual_unit
 from otolith.cli.commissioning.draft.writing import (
     MachineDraft,
     ReadSignal,
@@ -138,7 +139,8 @@ def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, ques
     echo(f"twin {name}: {twin.title}")
     if not (proposal.fits or questions.asks):
         lacking = "; ".join(f"{row} ({meaning_of(twin, row)}, {twin.unit_of(row)})" for row in proposal.missing)
-        remedy = "--signal SIGNAL=NAME tells which signal it is, --unit NAME=UNIT its unit, --twin another twin"
+        remedy = "--signal SIGNAL=NAME tells which signal it is, --unit NAME=UNIT its unit, --twin another twin; "
+        remedy += "docs/describe-your-machine.md has how to write a twin of your own"
         raise ConfigurationError(f"twin {name} needs what nothing offers: {lacking}: {remedy}")
     return proposal
 
@@ -195,7 +197,9 @@ def _read(twin: Definition, name: str, offer: Offer, why: str, answers: Answers,
 
     unit = offer.unit
     if unit is None:
-        unit = questions.text(f"Unit of {offer.name}", target, fitting)
+        usual = usual_unit(offer.name)
+        is_fitting = usual is not None and target == "rad/s"
+        unit = questions.text(f"Unit of {offer.name}", usual if usual and is_fitting else target, fitting)
         if not questions.asks:
             why = f"{why}; the unit is assumed, --unit {offer.name}=UNIT states it".removeprefix("; ")
     _check_unit(twin, name, offer, unit)

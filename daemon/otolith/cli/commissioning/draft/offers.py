@@ -1,5 +1,6 @@
 """What a recording or a bus offers: signals with their names, units and values. Nothing is read or asked in here."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,7 @@ from otolith.estimation.data_checks import MAD_TO_SD
 from otolith.estimation.objective import adc_step
 from otolith_drivers.units import is_unit
 
+BEHIND_IN = re.compile(r"\bin\s+\[?([^\s\]]+)\]?$")
 MIN_SAMPLES = 20  # values from which a noise level is taken
 UNIT_ENDINGS = ("rpm", "upm", "V", "mV", "A", "mA", "Nm", "N", "Hz", "bar", "kPa", "Pa", "m", "mm", "rad", "deg")
 """Units that stand at the end of a name, as in ``speed_rpm``; others would be words or symbols."""
@@ -65,6 +67,8 @@ def noise_level(values: Array) -> float | None:
 
 
 def unit_in(name: str) -> str | None:
-    """Return the unit at the end of a name, as in ``speed_rpm``; None if there is none."""
+    """Return the unit at the end of a name, as in ``speed_rpm`` or ``n in 1/min``; None if there is none."""
+    if (written := BEHIND_IN.search(name)) and is_unit(written[1]):
+        return written[1]
     ending = name.rpartition("_")[2]
     return ending if ending != name and ending in UNIT_ENDINGS and is_unit(ending) else None

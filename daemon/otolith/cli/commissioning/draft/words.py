@@ -62,6 +62,15 @@ WORDS = QUANTITIES | QUALIFIERS
 INSIDE = sorted((word for word in WORDS if len(word) >= MIN_INSIDE), key=len, reverse=True)
 
 
+USUAL_UNITS = {"drehzahl": "1/min", "umdrehung": "1/min", "upm": "1/min", "rpm": "1/min"}
+"""By a word in the name of a signal without a unit: the unit in which drives give it."""
+
+
+def usual_unit(name: str) -> str | None:
+    """Return the unit in which drives give a signal of that name; None if it is not known by its name."""
+    return next((unit for word, unit in USUAL_UNITS.items() if word in name.casefold()), None)
+
+
 def meanings(name: str) -> frozenset[str]:
     """Return what the words in ``name`` mean; a symbol counts where no word names a quantity."""
     parts = [part.casefold().translate(UMLAUTS) for part in PART.findall(HUMP.sub(" ", name))]
