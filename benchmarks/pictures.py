@@ -1,6 +1,4 @@
-"""The pictures of the docs: reports and recordings of a simulated motor, healthy and with three faults.
-
-    python -m benchmarks.pictures docs/pictures
+"""Pictures of the docs, for ``make screens``: reports and recordings of a motor, healthy and with three faults.
 
 Reports are shown by a headless Chromium, recordings by the Rerun viewer under Xvfb. On Debian: ``apt install chromium
 xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libx11-xcb1 libxcursor1 libxrandr2 libxi6``.
@@ -19,10 +17,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import click
 from PIL import Image
 
-from benchmarks.browser import browser, program
+from benchmarks.browser import Browser
 from benchmarks.diagnosis import machine_of, of_scenario
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
@@ -111,13 +108,12 @@ def reduced(picture: bytes, size: tuple[int, int] = SIZE) -> bytes:
     return output.getvalue()
 
 
-@click.command(help=__doc__)
-@click.argument("folder", type=click.Path(path_type=Path, file_okay=False, exists=True))
-def main(folder: Path) -> None:
-    path = program()
-    if path is None or shutil.which("xvfb-run") is None:
-        sys.exit("chromium or xvfb-run is not installed")
-    with tempfile.TemporaryDirectory() as name, browser(path) as tab:
+def write_situations(folder: Path, tab: Browser) -> None:
+    """Write report and recording of each situation into ``folder``; without Xvfb recordings stay as they are."""
+    has_screen = shutil.which("xvfb-run") is not None
+    if not has_screen:
+        print("xvfb-run is not installed: the pictures of recordings stay as they are", file=sys.stderr)
+    with tempfile.TemporaryDirectory() as name:
         for situation in FAULTS:
             place = Path(name) / situation
             place.mkdir()
@@ -126,8 +122,5 @@ def main(folder: Path) -> None:
             file.write_text(page(reports, place), encoding="utf-8")
             tab.open(file, *SIZE)
             (folder / f"report-{situation}.png").write_bytes(reduced(tab.picture()))
-            (folder / f"recording-{situation}.png").write_bytes(reduced(recording_picture(reports, place)))
-
-
-if __name__ == "__main__":
-    main()
+            if has_screen:
+                (folder / f"recording-{situation}.png").write_bytes(reduced(recording_picture(reports, place)))

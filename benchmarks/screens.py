@@ -2,7 +2,8 @@
 
     make screens
 
-writes ``docs/screens.md`` and its pictures, and the picture of the README. Pages are shown by a headless Chromium.
+writes ``docs/screens.md`` and its pictures, and those of README and ``docs/history.md``. A headless Chromium shows the
+pages.
 """
 
 import io
@@ -24,7 +25,7 @@ from rich.console import Console, RenderableType
 
 from benchmarks.browser import Browser, browser, program
 from benchmarks.motor import CONFIG, RECORDS, windows
-from benchmarks.pictures import reduced
+from benchmarks.pictures import reduced, write_situations
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.cli.console import Terminal
@@ -52,7 +53,7 @@ INTRODUCTION = """# Screens
 
 What a person sees of the demo's motor: the armature resistance falls from 15 s on, and the rotor gets out of balance at
 45 s. Each screen says the state, since when, and what to do. `make screens` makes this page from a seeded run of the
-same scenario, in half a minute; times are those of a plant in Berlin.
+same scenario, in a minute or two; times are those of a plant in Berlin.
 """
 
 
@@ -252,6 +253,7 @@ def main() -> None:
             "The engineer's text in a recording": report_text(last),
         }
         (DOCS / "screens.md").write_text(document_of(texts), encoding="utf-8")
+        write_situations(pictures, tab)
 
 
 if __name__ == "__main__":
