@@ -80,6 +80,13 @@ def test_a_note_is_published_once_and_stays_with_the_event(worn: Run) -> None:
     assert_says(event_text(cleared), "cleared", "the winding was dried")
 
 
+def test_the_words_of_a_person_are_not_translated(worn: Run) -> None:
+    worn.note(Deed.COMMENT, 'the "old" one had 6.5 ohm')
+    worn.windows(1, WORN)
+    german = worn.event.model_copy(update={"language": "de"})
+    assert_says(event_text(german), "Kommentar von anna", "the 'old' one had 6.5 ohm")
+
+
 def test_what_becomes_worse_is_not_acknowledged_any_more(worn: Run) -> None:
     worn.note(Deed.ACKNOWLEDGE)
     worn.windows(1, WORN)

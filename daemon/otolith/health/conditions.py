@@ -52,9 +52,9 @@ def condition_page(rule: Rule, rules: Sequence[Rule], texts: Texts) -> Condition
         "stop": texts.conditions[f"stop_{stop}"],
         "other": " ".join(_other(rule, rules, texts)),
         "clears": texts.conditions[f"clears_{clears}"].format(**_numbers(rule)),
-        "source": rule.source,
     }
-    return ConditionPage(rule.id, rule.condition, {key: text for key, text in sections.items() if text})
+    written = {key: texts.decimals(text) for key, text in sections.items() if text}
+    return ConditionPage(rule.id, rule.condition, {**written, "source": rule.source})
 
 
 def pages_of(condition_ids: Iterable[str], rules: Sequence[Rule], texts: Texts) -> list[ConditionPage]:

@@ -188,12 +188,16 @@ def explain_command(event: EventDocument) -> str:
 
 
 def note_texts(event: EventDocument, when: Clock) -> list[str]:
-    """What persons did with an event, a sentence each: until when it is shelved, who has seen it, and comments."""
+    """What persons did with an event, a sentence each: until when it is shelved, who has seen it, and comments.
+
+    Their words are in quotation marks, in which nothing is translated.
+    """
     texts = texts_in(event.language)
 
     def sentence(key: str, note: NoteDocument) -> str:
         until = "" if note.until is None else when(note.until)
-        text = f": {note.text}" if note.text else ""
+        words = note.text.replace('"', "'")
+        text = f': "{words}"' if words else ""
         return texts(key, time=when(note.at), until=until, by=note.by, text=text)
 
     notes = [("shelved", event.shelved), ("acknowledged", event.acknowledged)]
