@@ -236,7 +236,8 @@ def _observations(
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
-    past = Past(state.steps, spans, state.trends, state.undetermined, state.doubtful, state.known_since)
+    held = {key: record.event.evidence.limit for key, record in state.records.items() if record.event is not None}
+    past = Past(state.steps, spans, state.trends, state.undetermined, held, state.doubtful, state.known_since)
     shown = observe(plan, report, levels, past)
     return earlier | {item.key: item for item in shown}
 

@@ -1,8 +1,8 @@
 """Limits of parameters and components, and which of them an estimate has passed, judged by its interval.
 
 A limit is passed if the value is beyond it with a probability of 97.5 %: if the whole 95 % interval is. A level is left
-if the value is back inside with the same probability, by a share of the distance to the nominal value. An estimate that
-wanders around its limit therefore changes nothing.
+if the value is back inside the limit that was passed with the same probability, by a share of the distance to the
+nominal value. An estimate that wanders around its limit therefore changes nothing.
 """
 
 import math
@@ -88,14 +88,18 @@ class MonitoredQuantity:
         texts = (f"{item.level} {item.side} {quantity_text(item.value, self.unit)}" for item in self.limits)
         return ", ".join(texts)
 
-    def level(self, value: float, sd: float, before: Level) -> tuple[Level, Limit | None]:
-        """Return the level of an estimate after the level ``before``, with the limit that decides it."""
+    def level(self, value: float, sd: float, before: Level, held: float | None = None) -> tuple[Level, Limit | None]:
+        """Return the level of an estimate after the level ``before``, with the limit that decides it.
+
+        ``held`` is the value of the limit that decided the level before. On the way to it all limits were passed that
+        lie nearer to the nominal value, and none on the other side of it.
+        """
         levels: list[tuple[Level, Limit | None]] = [(Level.OK, None)]
         for limit in self.limits:
             excess, reach = limit.excess(value), QUANTILE * sd
             release = RELEASE * abs(limit.value - self.nominal)
-            stays = before.rank >= limit.level.rank and excess > -release - reach
-            if excess > reach or stays:
+            was_passed = before.rank >= limit.level.rank and held is not None and limit.excess(held) >= 0.0
+            if excess > reach or (was_passed and excess > -release - reach):
                 levels.append((limit.level, limit))
         return max(levels, key=lambda item: item[0].rank)
 

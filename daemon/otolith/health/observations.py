@@ -80,6 +80,7 @@ class Past:
     spans: Mapping[str, float]  # Length of the history of each, s
     trends: Mapping[str, SeenTrend]  # See HealthState.trends
     undetermined: Mapping[str, float]  # Time for which the machine has moved since each was determined, s
+    held: Mapping[str, float | None]  # Value of the limit that decided the level of each condition, by its key
     doubtful: tuple[int, ...] = ()  # See HealthState.doubtful
     known_since: float | None = None  # See HealthState.known_since
 
@@ -99,16 +100,15 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
         observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
     observations.append(_of_returns(plan, report, before, past.doubtful))
     for name, parameter in report.parameters.items():
-        own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
+        own = _of_parameter(plan, report, name, before, past)
         observations += [own, _of_trend(plan, report, name, own.level, past)]
         observations.append(_of_lost(plan, report, name, parameter, past.undetermined.get(name, 0.0)))
     observations += _without_temperature(plan, report)
-    components = (_of_component(plan, report.twin, component, before) for component in report.components)
+    components = (_of_component(plan, report.twin, component, before, past) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
-            level = before.get(finding.id, Level.OK)
-            observations.append(_of_finding(plan, report.twin, finding, level, past.known_since))
+            observations.append(_of_finding(plan, report.twin, finding, before, past))
     return observations
 
 
@@ -150,10 +150,10 @@ def _of_returns(
 
 
 def _of_finding(
-    plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level, known_since: float | None
+    plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Mapping[str, Level], past: Past
 ) -> Observation:
     """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
-    is_from_start = finding.of_file or known_since is None or finding.since < known_since
+    is_from_start = finding.of_file or past.known_since is None or finding.since < past.known_since
     features = FindingFeatures(finding.kind, twin, finding.subject, manner=FROM_START if is_from_start else "")
     part = PARTS.get(finding.kind, MACHINE)
     level = severity(plan.rules, features)
@@ -162,7 +162,7 @@ def _of_finding(
     if (value := finding.value) is not None:
         quantity = plan.known.get(finding.subject, MonitoredQuantity())
         part = quantity.part
-        passed, limit = quantity.level(value.value, value.sd, before)
+        passed, limit = quantity.level(value.value, value.sd, *_held(finding.id, before, past))
         level = passed if quantity.limits else level
         deviation = value.value - quantity.nominal
         features = replace(features, side="below" if deviation < 0.0 else "above", manner="step")
@@ -177,7 +177,7 @@ def _of_finding(
 
 
 def _of_parameter(
-    plan: MonitoringPlan, report: ReportDocument, name: str, before: Mapping[str, Level], step: float
+    plan: MonitoringPlan, report: ReportDocument, name: str, before: Mapping[str, Level], past: Past
 ) -> Observation:
     """Return the observation of a parameter, whose level is not known unless this window determines it."""
     key, parameter, quantity = f"limit/{name}", report.parameters[name], plan.parameters.get(name, MonitoredQuantity())
@@ -187,13 +187,13 @@ def _of_parameter(
     if referred is None:
         return Observation(key, quantity.part, None)
     deviation = referred[0] - quantity.nominal
-    level, limit = quantity.level(*referred, before.get(key, Level.OK))
+    level, limit = quantity.level(*referred, *_held(key, before, past))
     if limit is None:
         return Observation(key, quantity.part, level)
     may_be_healthy = max(abs(deviation), abs(limit.excess(referred[0]))) <= QUANTILE * referred[1]
     if may_be_healthy and level is before.get(key, Level.OK):
         return Observation(key, quantity.part, None)
-    manner = _manner(parameter, deviation, step)
+    manner = _manner(parameter, deviation, past.steps.get(name, 0.0))
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
     texts = plan.texts
     against = texts("of_baseline") if quantity.has_baseline else ""
@@ -204,6 +204,11 @@ def _of_parameter(
     ahead = {"expected": expected and f", {expected}", "warming": _warming(quantity, deviation, texts)}
     text = texts("limit", **what, beside=_beside(limit, referred[0], unit, texts), **ahead)
     return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
+
+
+def _held(key: str, before: Mapping[str, Level], past: Past) -> tuple[Level, float | None]:
+    """Return the level of a condition before the window, and the value of the limit that decided it."""
+    return before.get(key, Level.OK), past.held.get(key)
 
 
 def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
@@ -297,7 +302,7 @@ def _manner(parameter: ParameterDocument, deviation: float, step: float) -> str:
 
 
 def _of_component(
-    plan: MonitoringPlan, twin: str, component: ComponentDocument, before: Mapping[str, Level]
+    plan: MonitoringPlan, twin: str, component: ComponentDocument, before: Mapping[str, Level], past: Past
 ) -> Observation:
     """Return the observation of a component; one that is expected, fades or is of the size of noise is no warning.
 
@@ -312,7 +317,7 @@ def _of_component(
     size, limit, level = abs(amplitude.value), None, Level.OK
     is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING
     if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
-        level, limit = quantity.level(size, amplitude.sd, before.get(key, Level.OK))
+        level, limit = quantity.level(size, amplitude.sd, *_held(key, before, past))
     elif size > QUANTILE * amplitude.sd and not is_expected:
         level = severity(plan.rules, features)
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)

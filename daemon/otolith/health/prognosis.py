@@ -222,7 +222,7 @@ def _shape(times: Array, onset: Array, now: float, exponent: Array) -> Array:
     """Return φ of the module's docstring, (cells, times)."""
     s = np.maximum(times[None, :] - onset[:, None], 0.0) / (now - onset[:, None])
     x = np.where(np.abs(exponent) < 1e-6, 1e-6, exponent)[:, None]  # the limit is the line
-    return np.asarray(np.expm1(np.minimum(x * s, 500.0)) / np.expm1(x))
+    return np.asarray(np.expm1(np.minimum(x * s, 300.0)) / np.expm1(x))  # its square is still a number
 
 
 def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = False) -> _Cells:
