@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy.special import stdtrit
 
 from otolith.commissioning import structure as module
 from otolith.commissioning.identification import identify_noise
@@ -100,14 +99,30 @@ def test_a_candidate_with_less_than_half_of_the_best_score_is_not_tried(
     assert tried == expected
 
 
-@pytest.mark.parametrize("count", [4, 6, 10, 30])
-def test_agreement_is_that_of_students_t(count: int) -> None:
-    """The scatter is that of windows of equal information around a mean of one; the limit is good to 15 %."""
-    limit = float(stdtrit(count - 1, 1.0 - module.SIGNIFICANCE))
-    signs = np.where(np.arange(count) % 2, 1.0, -1.0)
-    for ratio, agree in ((1.15 * limit, True), (0.99 * limit, False)):
-        values = 1.0 + signs * np.sqrt(count) / ratio
-        assert (module._amplitude_sd(values, np.ones(count)) is not None) is agree
+@pytest.mark.parametrize("spread", [1.0, 3.0])
+@pytest.mark.parametrize("count", [4, 8])
+def test_amplitudes_of_noise_agree_as_often_as_stated(
+    count: int, spread: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of either sign, with windows of equal and of different information."""
+    monkeypatch.setattr(module, "SIGNIFICANCE", 0.02)
+    random = np.random.default_rng(count)
+    information = np.geomspace(1.0, spread, count)
+    amplitudes = random.standard_normal((10_000, count)) / np.sqrt(information)
+    agreeing = sum(module._amplitude_sd(values, information) is not None for values in amplitudes)
+    assert 0.015 < agreeing / len(amplitudes) < 0.025
+
+
+def test_one_window_alone_shows_no_agreement() -> None:
+    values, information = np.full(8, 10.0), np.ones(8)
+    assert module._amplitude_sd(values, information) is not None
+    information[0] = 1e3
+    assert module._amplitude_sd(values, information) is None
+
+
+def test_the_sd_of_an_amplitude_is_that_of_a_mean() -> None:
+    values = np.random.default_rng(1).normal(10.0, 0.1, 8)
+    assert module._amplitude_sd(values, np.ones(8)) == pytest.approx(values.std(ddof=1) / np.sqrt(8.0))
 
 
 def test_a_slow_sine_of_the_position_does_not_stand_out() -> None:

@@ -44,7 +44,6 @@ from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
-AGREEMENT = 3.72  # standard deviations of the normal distribution that are exceeded with that probability
 CHANCE_DEVIATE = 3.0  # standard deviations that count as chance: of χ² of further phases, of a parameter's value
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
@@ -52,6 +51,7 @@ NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain i
 MIN_LINE = 6.0  # spectral lines: least frequency of a sine with one phase that is compared with its neighbours
 MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best, but for a sine that stands out
 SHORTEST = 1e-300  # of a source within a window: the frequency of a sine in it stays finite
+MAX_CONCENTRATION = 0.5  # sum of the squared shares of information: one window alone would decide
 ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
 AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # of a running twin that are searched together, and records of all of them
@@ -363,19 +363,17 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
 def _amplitude_sd(values: Array, information: Array) -> float | None:
     """Return the standard deviation of the weighted mean of the amplitudes ``values`` (windows,), from their scatter.
 
-    None if the mean is not significant by Student's t test: the windows do not agree on an amplitude.
+    None if the mean is not significant by Student's t test of both signs: the windows do not agree on an amplitude. The
+    variance of each is inverse to its ``information`` (windows,), times a common factor.
     """
-    shares = information / information.sum()
+    from scipy.special import stdtr  # noqa: PLC0415 - only a component that would be significant needs SciPy
+
+    shares, degrees = information / information.sum(), len(values) - 1.0
     mean = float(shares @ values)
-    sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
-    effective = 1.0 / float((shares**2).sum())  # number of windows
-    degrees = effective - 1.0
-    if degrees <= 1.0 or not mean:
+    if not mean or (shares**2).sum() >= MAX_CONCENTRATION:
         return None
-    # Student's t as a standard normal deviate (D. L. Wallace, Annals of Mathematical Statistics 30, 1959).
-    squared = degrees * np.log1p((mean / max(sd, ROUNDING * abs(mean))) ** 2 / degrees)
-    deviate = (8.0 * degrees + 1.0) / (8.0 * degrees + 3.0) * np.sqrt(squared)
-    return sd if deviate > AGREEMENT else None
+    sd = max(float(np.sqrt(shares @ (values - mean) ** 2 / degrees)), ROUNDING * abs(mean))
+    return sd if 2.0 * stdtr(degrees, -abs(mean) / sd) < SIGNIFICANCE else None
 
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:
