@@ -11,7 +11,8 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation import imm_filter
+from otolith.estimation.imm_filter import ParameterCusum, shift_limit
 from otolith.estimation.information import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -90,8 +91,24 @@ def test_a_wrong_window_alone_moves_nothing() -> None:
 
 
 def test_a_parameter_that_is_shifted_along_moves_with_the_other() -> None:
-    assert ParameterCusum(np.array([[5.5, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == [0, 1]
-    assert ParameterCusum(np.array([[4.9, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == []
+    limit = shift_limit(6)
+    for share, moved in ((1.1, [0, 1]), (0.98, [])):
+        sums = limit * np.array([[share, 0.52, 0.48], [0.0, 0.0, 0.0]])
+        assert ParameterCusum(sums).moved == moved
+
+
+@pytest.mark.parametrize(("parameters", "least"), [(1, 0), (2, 30), (6, 30)])
+def test_sums_of_healthy_windows_alarm_as_often_as_stated(
+    parameters: int, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any of them, upwards or downwards, however many parameters there are."""
+    monkeypatch.setattr(imm_filter, "WINDOWS_PER_ALARM", 500.0)
+    random, sums, alarms = np.random.default_rng(parameters), ParameterCusum(), 0
+    for shifts in random.standard_normal((30_000, parameters)):
+        sums = sums.after(shifts)
+        if sums.moved:
+            sums, alarms = ParameterCusum(), alarms + 1
+    assert least <= alarms <= 75  # 60 are expected of two parameters and more
 
 
 def test_a_reset_of_one_parameter_forgets_no_other() -> None:

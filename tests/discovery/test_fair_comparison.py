@@ -25,6 +25,7 @@ from otolith.discovery.hypotheses import (
     nothing_happened,
     with_candidate,
 )
+from otolith.discovery.screening import NULL_ODDS, prior_deviance
 from otolith.discovery.search import fit_hypotheses
 from otolith.estimation.information import Prior, forget_parameter, initial_prior
 from otolith.estimation.problem import Component, Problem
@@ -203,3 +204,12 @@ def test_a_constant_represents_what_hardly_varies(run: int) -> None:
         components = [item for item in report.stated if item.reason == "COMPONENT"]
         best = max(components, key=lambda item: item.probability)
         assert re.fullmatch(r"shaft: -0\.000\d+ N·m", best.text), best
+
+
+def test_the_types_have_equal_odds_before_any_evidence() -> None:
+    """However many hypotheses of a type there are; screening and search charge a form the same."""
+    for alternatives in (1.0, 40.0):
+        stated = FaultHypothesis(FaultType.COMPONENT, alternatives=alternatives)
+        assert alternatives * np.exp(-0.5 * stated.prior_deviance) == pytest.approx(1.0 / NULL_ODDS)
+        assert stated.prior_deviance == float(prior_deviance(alternatives))
+    assert FaultHypothesis(FaultType.NOTHING).prior_deviance == 0.0

@@ -1,9 +1,12 @@
 """Forecasts from histories: right and covered on degradations, none without a trend; histories stay small."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from benchmarks.prognosis import QUANTITY, SHARES, coverage, median_error, run, run_motor
 
+from otolith.acquisition.window import Array
 from otolith.discovery.decision import WindowDecision
 from otolith.health.events import HealthState, assess
 from otolith.health.prognosis import (
@@ -13,6 +16,7 @@ from otolith.health.prognosis import (
     REFIT,
     History,
     Trend,
+    errors_of_means,
     find_trend,
     forecast,
     is_plausible,
@@ -48,6 +52,53 @@ def test_eighty_percent_intervals_hold_eighty_percent() -> None:
     outcomes = [outcome for seed in range(1, 101) for outcome in run(seed)]
     assert median_error(outcomes) < 0.1
     assert 0.75 <= coverage(outcomes) <= 0.85
+
+
+def correlated(count: int, rho: float, random: np.random.Generator) -> Array:
+    """(count,) errors of variance one, of which each is correlated with the one before."""
+    errors = random.standard_normal(count)
+    for index in range(1, count):
+        errors[index] = rho * errors[index - 1] + np.sqrt(1.0 - rho**2) * errors[index]
+    return errors
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("growth", [0.0, 3.0])
+def test_intervals_of_long_histories_with_correlated_errors_hold_eighty_percent(growth: float) -> None:
+    """Of thousands of estimates; all but the last points are means of many, which average less out than is stated."""
+    period, held = 2.0, list[bool]()
+    for count, rho in product([800, 3000], [0.0, 0.5, 0.9]):
+        times = period * np.arange(1, count + 1)
+        points = np.array(history_of([0.0] * count, period))
+        numbers = np.rint(SD**2 / points[:, 2]).astype(int)
+        for seed in range(40):
+            random = np.random.default_rng(seed)
+            onset, end = period * count * random.uniform([0.0, 1.2], [0.3, 2.0])
+            share = np.maximum(times - onset, 0.0) / (end - onset)
+            shape = np.expm1(growth * share) / np.expm1(growth) if growth else share
+            values = NOMINAL - 0.65 * shape + random.uniform(0.7, 1.4) * SD * correlated(count, rho, random)
+            points[:, 1] = np.add.reduceat(values, np.cumsum([0, *numbers[:-1]])) / numbers
+            crossing = forecast(QUANTITY, tuple(map(tuple, points.tolist()))).act
+            assert crossing is not None
+            held.append(crossing.low <= end <= (crossing.high or np.inf))
+    assert 0.75 <= np.mean(held) <= 0.85
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.97])
+def test_the_error_of_a_mean_of_correlated_estimates_is_that_of_an_autoregressive_process(rho: float) -> None:
+    numbers = np.array([30, 30, 30, 8, 8, 8, 1, 1, 1])
+    ends = np.cumsum(numbers)
+    means = np.zeros((len(numbers), ends[-1]))
+    for row, (end, number) in enumerate(zip(ends, numbers, strict=True)):
+        means[row, end - number : end] = 1.0 / number
+    covariance = means @ rho ** np.abs(np.subtract.outer(np.arange(ends[-1]), np.arange(ends[-1]))) @ means.T
+    sd = np.sqrt(np.diag(covariance))
+    expected = np.diag(covariance, 1) / (sd[1:] * sd[:-1])
+    middles = ends - 0.5 * (numbers + 1.0)
+    factors, correlation = errors_of_means(np.diff(middles), np.array([[rho]]))
+    inner, pairs = [0, 1, 3, 4, 6, 7, 8], [0, 3, 6, 7]  # of means that are as long as the distances beside them
+    assert factors[0, inner] == pytest.approx((sd**2 * numbers)[inner], rel=1e-9)
+    assert correlation[0, pairs] == pytest.approx(expected[pairs], rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -21,6 +21,7 @@ from otolith.discovery.screening import (
     grid_guesses,
     highest_lines,
     inner_grid,
+    prior_deviance,
 )
 from otolith.estimation.problem import Component, Problem, key_of
 from otolith.twin.components import measured_speeds, sites, sources
@@ -164,7 +165,7 @@ def _without_parameters(
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
     constants = [guess for guess in guesses if guess.form.model.name == "constant"]
-    gains = {own.form: own.score + 2.0 * float(np.log(competing.of(own.form))) for own in constants}  # without prior
+    gains = {own.form: own.score + float(prior_deviance(competing.of(own.form))) for own in constants}  # without prior
     offsets = [gain for form, gain in gains.items() if competing.is_sensor(form)]
     causes = {
         form

@@ -13,7 +13,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
-from otolith.discovery.screening import DECISIVE
+from otolith.discovery.screening import DECISIVE, prior_deviance
 from otolith.estimation.information import QUANTILE, Evidence, Prior, extend_prior, initial_prior, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment, equation, indices, site_of
@@ -55,8 +55,8 @@ class FaultHypothesis:
 
     @property
     def prior_deviance(self) -> float:
-        """-2 log of the prior weight: 1 for the null hypothesis, 1/3 for each other type, shared by its hypotheses."""
-        return 0.0 if self.type is FaultType.NOTHING else float(2.0 * np.log(3.0 * self.alternatives))
+        """-2 log of the prior odds against the null hypothesis; those of a type share its probability."""
+        return 0.0 if self.type is FaultType.NOTHING else float(prior_deviance(self.alternatives))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,6 +29,7 @@ from otolith.twin.components import (
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 FRICTION_OF_INPUT = 100.0  # how much less probable than of a state: 9.2 in -2 log evidence, just below DECISIVE
 COARSE = 1.5  # spectral lines between two frequencies
 ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral line whose gain is computed
@@ -38,6 +39,11 @@ MAX_AMPLITUDE = 1e9  # in the unit of the site
 MAX_RECORDS = 5000  # last records of a window that are searched
 SAME_SIGN = 0.8  # mean product of the signs of two sources that change their signs together
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
+
+
+def prior_deviance(alternatives: float | Array) -> Array:
+    """Return -2 log of the prior odds of one of so many hypotheses of a type against the null hypothesis."""
+    return np.asarray(2.0 * np.log(NULL_ODDS * alternatives))
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +232,7 @@ class ScoredGuesses:
         of_form = {key: (float(_parameter_count(form)), competing.of(form)) for key, form in forms.items()}
         parameters, competitors = np.array([of_form[id(form)] for form, _ in guesses]).reshape(-1, 2).T
         variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competitors)
+        scores = statistics.gain / variance_factor - parameters * np.log(count) - prior_deviance(competitors)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
 
     def __getitem__(self, index: int) -> ScoredGuess:
@@ -291,7 +297,7 @@ def _delay_gain(response: LinearResponse) -> float:
     gains = response.score_delays().gain
     best, count = float(gains.max(initial=0.0)), response.objective.count
     variance_factor = max((response.chi_square - best) / count, 1.0)
-    return float(best / variance_factor - np.log(count) - 2.0 * np.log(3.0 * len(gains))) - DECISIVE
+    return float(best / variance_factor - np.log(count) - prior_deviance(len(gains))) - DECISIVE
 
 
 def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> Fit:
@@ -339,7 +345,7 @@ def promising_guesses(response: LinearResponse, forms: list[CandidateForm], comp
     """
 
     def least(form: CandidateForm) -> float:
-        penalty = _parameter_count(form) * np.log(response.objective.count) + 2.0 * np.log(3.0 * competing.of(form))
+        penalty = _parameter_count(form) * np.log(response.objective.count) + prior_deviance(competing.of(form))
         return ESTIMATE_SHARE * (DECISIVE + float(penalty))
 
     lines: list[tuple[float, Guess]] = []

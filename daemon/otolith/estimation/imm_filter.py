@@ -38,8 +38,10 @@ MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no furth
 NIS_DEVIATE = 6.0  # of the standard normal distribution: exceeded by one healthy window in a thousand million
 MAX_PRECISION = 1e7  # of a window: prior standard deviations over its own, in the direction of which it states most
 SHIFT_REFERENCE = 1.0  # standard deviations: a window that shifts a parameter by less is evidence against a change
-LARGEST_SHIFT = 4.0  # standard deviations that one window counts: a wrong window alone does not reach the limit
-SHIFT_LIMIT = 5.0  # standard deviations: the sums of healthy windows exceed it once in a hundred thousand
+LARGEST_SHARE = 0.6  # of the limit that one window adds at most: a wrong window alone does not reach it
+WINDOWS_PER_ALARM = 3e4  # healthy windows in which one of all sums exceeds its limit once
+LEAST_SUMS = 4  # for which the limit is computed: of one parameter it is that of two
+OVERSHOOT = 1.166  # standard deviations by which a sum exceeds its limit, twice: 2 · 0.583
 SHIFTED_ALONG = 0.5  # of the limit: sum of a parameter that has been shifted along with another
 MAX_INFLATION = 25.0  # largest factor by which one contradictory window raises the variance ratio
 
@@ -214,9 +216,9 @@ class ParameterCusum:
 
     def after(self, shifts: Array) -> "ParameterCusum":
         """Return the sums after a window of these ``shifts`` (free,), in standard deviations."""
-        both = np.clip([shifts, -shifts], None, LARGEST_SHIFT)
+        both = np.array([shifts, -shifts]) - SHIFT_REFERENCE
         before = self.sums if self.sums is not None and self.sums.shape == both.shape else np.zeros(both.shape)
-        return ParameterCusum(np.maximum(before + both - SHIFT_REFERENCE, 0.0))
+        return ParameterCusum(np.maximum(before + np.minimum(both, LARGEST_SHARE * shift_limit(both.size)), 0.0))
 
     @property
     def moved(self) -> list[int]:
@@ -225,10 +227,19 @@ class ParameterCusum:
         A change also shifts parameters that are correlated with the one that has moved. They count as moved from a
         share of the limit on.
         """
-        if self.sums is None or not (self.sums > SHIFT_LIMIT).any():
+        if self.sums is None or not (self.sums > (limit := shift_limit(self.sums.size))).any():
             return []
         farthest: Array = self.sums.max(axis=0)
-        return np.flatnonzero(farthest > SHIFTED_ALONG * SHIFT_LIMIT).tolist()
+        return np.flatnonzero(farthest > SHIFTED_ALONG * limit).tolist()
+
+
+def shift_limit(sums: int) -> float:
+    """Return the limit of each of so many ``sums``, from the mean time to a false alarm of any of them.
+
+    (D. Siegmund, Sequential Analysis, section 2.6.)
+    """
+    exponent = np.log(2.0 * SHIFT_REFERENCE**2 * WINDOWS_PER_ALARM * max(sums, LEAST_SUMS))
+    return float(exponent / (2.0 * SHIFT_REFERENCE) - OVERSHOOT)
 
 
 def nis_limit(degrees: float) -> float:

@@ -180,7 +180,11 @@ class Posterior:
         return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
 
     def reset_parameters(self, moved: Iterable[int]) -> "Posterior":
-        """Return the same with the initial prior for the parameters at the indices ``moved``, and for their trends."""
+        """Return the same with the initial prior for the parameters at the indices ``moved``, and for their trends.
+
+        Windows agreed on constant parameters: unlike one that a single window shows to have moved
+        (:func:`forget_parameter`), they are on no fast ramp, and a wider trend would cost accuracy.
+        """
         belief, prior, size = self.belief, initial_prior(self.problem), _size(self.problem)
         for index in moved:
             for at in (index, index + len(self.problem.free)):

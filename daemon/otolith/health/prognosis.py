@@ -43,7 +43,7 @@ MIN_CHANGE = 0.1  # of the distance to a limit that a trend must have covered, f
 HORIZON = 10.0  # spans of the history after now: no forecast beyond
 COVERAGE = 0.8  # probability of the interval of a forecast
 GROWTH = (-6.0, 8.0)  # lowest and highest exponent of an exponential between its onset and now
-GRID = 13, 15, 7  # points of onset, exponent and time constant
+GRID = 13, 15, 10  # points of onset, exponent and time constant
 REFINEMENTS = 9  # of the grid, at most
 REFINED = 0.2  # of the points of a grid: how many must have weight so that it is not refined any more
 MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, from which on it counts
@@ -184,7 +184,7 @@ class _Data:
     times: Array
     origin: float  # Of the values
     values: Array
-    deviations: Array
+    deviations: Array  # (time constants, points)
     change: float
     correlation: Array  # (time constants, points - 1) of consecutive errors
     innovation: Array  # Share of the variance of an error that the one before does not predict
@@ -193,17 +193,30 @@ class _Data:
     def of(cls, history: History, change: float) -> "_Data":
         times, values, variances = np.array(history).T
         gaps = np.diff(times)
-        ages = gaps / np.geomspace(0.3 * gaps.min(), 0.5 * span(history), GRID[2])[:, None]
-        deviations, origin = np.sqrt(variances), float(values[-1])
-        return cls(times, origin, values - origin, deviations, change, np.exp(-ages), -np.expm1(-2.0 * ages))
+        shortest, constants = gaps.min(), np.geomspace(0.3 * gaps.min(), 0.5 * span(history), GRID[2])[:, None]
+        factors, correlation = errors_of_means(gaps / shortest, np.exp(-shortest / constants))
+        deviations, origin = np.sqrt(factors * variances), float(values[-1])
+        return cls(times, origin, values - origin, deviations, change, correlation, 1.0 - correlation**2)
 
     def whitened(self, rows: Array) -> Array:
         """Return (rows, points) for each time constant: (time constants, rows, points) with independent errors."""
-        scaled = rows / self.deviations
+        scaled = rows / self.deviations[:, None, :]
         rho = self.correlation[:, None, :]
-        later = (scaled[None, :, 1:] - rho * scaled[None, :, :-1]) / np.sqrt(self.innovation[:, None, :])
-        first = np.broadcast_to(scaled[None, :, :1], (*later.shape[:2], 1))
-        return np.concatenate([first, later], axis=2)
+        later = (scaled[:, :, 1:] - rho * scaled[:, :, :-1]) / np.sqrt(self.innovation[:, None, :])
+        return np.concatenate([scaled[:, :, :1], later], axis=2)
+
+
+def errors_of_means(gaps: Array, rho: Array) -> tuple[Array, Array]:
+    """Return by what the variance of each point exceeds that of independent estimates, and the correlation of the next.
+
+    A point is the mean of the estimates that came one after the other within the shorter of the ``gaps`` beside it, in
+    intervals of two estimates (points - 1,). ``rho`` (time constants, 1) is the correlation of two such estimates.
+    """
+    number = np.minimum(np.concatenate([gaps[:1], gaps]), np.concatenate([gaps, gaps[-1:]]))
+    together = (1.0 - rho**number) / (1.0 - rho)
+    factors = (1.0 + rho - 2.0 * rho * together / number) / (1.0 - rho)
+    size = together / np.sqrt(number * factors)
+    return factors, rho ** (gaps - 0.5 * (number[:-1] + number[1:]) + 1.0) * size[:, :-1] * size[:, 1:]
 
 
 def _together(*families: _Cells) -> _Cells:
@@ -249,7 +262,8 @@ def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = Fa
     # The factor on the variances has an inverse gamma posterior of this scale and order.
     scale, order = FACTOR_SHAPE + 0.5 * np.maximum(residual, 0.0), FACTOR_SHAPE + 0.5 * points
     log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - order * np.log(scale)
-    log_weight -= 0.5 * np.log(data.innovation).sum(1)[:, None] + math.log(log_weight.size)
+    log_weight -= (0.5 * np.log(data.innovation).sum(1) + np.log(data.deviations).sum(1))[:, None]
+    log_weight -= math.log(log_weight.size)
     covariance = covariance * (scale / (order - 1.0))[..., None, None]
     mean[..., 0] += data.origin
     onset, exponent = (np.tile(each, len(rows)) for each in (onset, exponent))
