@@ -8,10 +8,15 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.estimation.problem import Problem, WindowExcitation, WindowOptions, next_records
+from otolith.discovery.experiment_design import NO_EXPERIMENT, Situation, deciding_experiment
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis
+from otolith.estimation.information import Prior, extend_prior
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import Component, Problem, WindowExcitation, WindowOptions, augment, next_records
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
+from tests.messages import assert_says
 
 TWIN = find_twin("dc_motor")
 FREE = tuple(parameter for parameter in TWIN.parameters if parameter.name in ("R_a", "J", "D"))
@@ -63,6 +68,54 @@ def test_advised_step_estimates_inertia_as_predicted() -> None:
     assert inertia.sd is not None
     assert 0.5 < 1.96 * inertia.sd / predicted < 2.0
     assert inertia.value == pytest.approx(0.001171, abs=3.0 * inertia.sd)
+
+
+INFORMED = Prior(
+    np.array([*(parameter.nominal for parameter in FREE), 0.0, 0.0, 0.0]),
+    np.diag(np.concatenate([0.003 * PROBLEM.scale, 1e-5 * PROBLEM.scale]) ** 2),
+)
+STILL = Situation(STEADY, np.array([CURRENT, SPEED]), RECORDS, PERIOD)
+
+
+def tracked(kind: FaultType, problem: Problem = PROBLEM, *, moved: float = 0.0) -> TrackedHypothesis:
+    """A hypothesis that knows its parameters to 0.3 %, of which the inertia may have moved by a share of itself."""
+    prior = extend_prior(INFORMED, PROBLEM, problem)
+    prior.mean[1] *= 1.0 + moved
+    return TrackedHypothesis(FaultHypothesis(kind), Posterior.initial(problem).set_prior(prior), 0.0, 0.0, 1.0)
+
+
+def test_a_change_of_speed_tells_a_late_speed_from_nothing_and_from_an_inertia() -> None:
+    late = tracked(FaultType.TIMING, replace(PROBLEM, delays=(("omega", 0.05),)))
+    for other in (tracked(FaultType.NOTHING), tracked(FaultType.PARAMETER, moved=0.3)):
+        for pair in ((late, other), (other, late)):
+            text = deciding_experiment(*pair, STILL)
+            assert_says(text, "V_a", "V", f"{STEADY[0]:.3g}")
+
+
+def test_noise_is_told_from_nothing_by_the_size_of_innovations() -> None:
+    noisy = tracked(FaultType.NOISE, PROBLEM.with_levels([0.0, 0.0, 0.005, 0.1]))
+    assert "V_a" in deciding_experiment(noisy, tracked(FaultType.NOTHING), STILL)
+
+
+def test_causes_of_the_same_signals_are_told_apart_by_no_experiment() -> None:
+    offset, torque = (
+        augment(PROBLEM, [Component(site, "constant", "", amplitude)])
+        for site, amplitude in (("sensor of T_load", -0.01), ("shaft", 0.01))
+    )
+    assert deciding_experiment(tracked(FaultType.SENSOR, offset), tracked(FaultType.COMPONENT, torque), STILL) == (
+        NO_EXPERIMENT
+    )
+
+
+def test_a_disturbed_machine_needs_a_larger_move() -> None:
+    """Process noise hides what sensor noise alone would show."""
+    sizes = []
+    for disturbed in (0.0, 2.0, 1e3):
+        problem = replace(PROBLEM, process_noise=(0.0, disturbed))
+        pair = tracked(FaultType.NOTHING, problem), tracked(FaultType.PARAMETER, problem, moved=0.1)
+        text = deciding_experiment(*pair, STILL)
+        sizes.append(np.inf if text == NO_EXPERIMENT else abs(float(text.split(" to ")[1].split()[0]) - STEADY[0]))
+    assert sizes[0] < sizes[1] <= sizes[2]
 
 
 def test_window_length_shrinks_as_the_trend_grows() -> None:

@@ -185,7 +185,7 @@ def _situation(estimated: WindowEstimate | None) -> Situation | None:
     if estimated is None or not np.isfinite(estimated.last_state).all():
         return None
     inputs, window = estimated.fit.objective.excitation.inputs[-1], estimated.fit.window
-    return Situation(inputs, estimated.last_state, window.records, window.sample_period)
+    return Situation(inputs, estimated.last_state, window.records, window.sample_period, window.end)
 
 
 def _parameters(

@@ -2,8 +2,9 @@
 
 A parameter is determined best by the experiment whose Fisher information is largest (E. Walter, L. Pronzato,
 Identification of Parametric Models from Experimental Data, 1997, chapter 6). Two hypotheses are distinguished best
-where their predictions differ most, after fitting the one to the other's prediction (A. C. Atkinson, V. V. Fedorov,
-Biometrika 62, 1975). The moves are steps and swings of one input at a time within its range, from the present state.
+where the expected evidence for the true one is largest, after fitting the other to what it predicts (A. C. Atkinson,
+V. V. Fedorov, Biometrika 62, 1975). The moves are steps and swings of one input at a time within its range, from the
+present state. A move is a window like any other: with the delays of its hypothesis, and with innovations as in a fit.
 """
 
 from collections.abc import Iterator
@@ -11,22 +12,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, TimeGrid
+from otolith.acquisition.window import Array, Window
 from otolith.discovery.hypotheses import TrackedHypothesis
-from otolith.discovery.screening import DECISIVE
-from otolith.estimation.information import QUANTILE, Prior
+from otolith.discovery.linear_response import chi_square_of_parameters
+from otolith.discovery.screening import DECISIVE, linearised
+from otolith.estimation.information import QUANTILE, Prior, information
+from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.twin.components import ELAPSED
+from otolith.estimation.timing import shifted
+from otolith.estimation.window_fit import Fit
 from otolith.twin.definition import Input
-from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.units import unit_text
 
 MOVE_SHARES = (0.1, 0.25, 0.5, 1.0)  # of the input's range; the smallest move that suffices is advised
 MAX_RECORDS = 200  # of a simulated experiment
 MIN_REDUCTION = 0.5  # share of the present interval that a move must reach to be advised
-MIN_DISTANCE = 2.0 * DECISIVE  # χ² between two predictions that decides with some certainty
-SUBSTEPS = 4
-REGULARISATION = 1e-12
+MIN_DISTANCE = 2.0 * DECISIVE  # expected evidence that decides with some certainty
 OTHER_INPUTS = " if the other inputs stay as they are"
 NO_EXPERIMENT = "no change of a single input can tell these causes apart: inspect the sensors and the machine"
 
@@ -39,6 +40,7 @@ class Situation:
     state: Array  # (states,)
     records: int
     sample_period: float  # Mean time between two records, s
+    end: float = 0.0  # Service time, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +71,10 @@ def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[st
 
 
 def deciding_experiment(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation) -> str:
-    """Return the smallest move that would distinguish ``first`` from ``second``, as a sentence."""
+    """Return the smallest move that would distinguish ``first`` from ``second``, whichever holds, as a sentence."""
+    pairs = (first, second), (second, first)
     for move in moves(first.problem, situation):
-        if _distance(first, second, situation, move) >= MIN_DISTANCE:
+        if all(_expected_evidence(wrong, true, situation, move) >= MIN_DISTANCE for wrong, true in pairs):
             return f"{move.text} would decide{OTHER_INPUTS}"
     return NO_EXPERIMENT
 
@@ -93,11 +96,6 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
                 yield Move(text, inputs)
 
 
-def _grid(situation: Situation, records: int) -> TimeGrid:
-    """Return the times of an experiment as long as the window."""
-    return TimeGrid.uniform(records, situation.records * situation.sample_period / records)
-
-
 def _ends(moved: Input, present: float, size: float) -> tuple[float, float]:
     """Return start and end of a move towards the farther end of the range."""
     reach = size * (moved.high - moved.low)
@@ -105,82 +103,50 @@ def _ends(moved: Input, present: float, size: float) -> tuple[float, float]:
     return present, min(max(target, moved.low), moved.high)
 
 
-def _parameter_values(problem: Problem, mean: Array) -> tuple[Array, list[int]]:
-    """Return all parameters of the twin (parameters,) and the columns of the free ones, which take ``mean``."""
-    order, given = [parameter.name for parameter in problem.twin.parameters], dict(problem.known)
-    values = np.array([given.get(parameter.name, parameter.nominal) for parameter in problem.twin.parameters])
-    columns = [order.index(parameter.name) for parameter in problem.free]
-    values[columns] = np.clip(mean[: len(columns)], *problem.bounds)
-    return values, columns
+def _experiment(problem: Problem, known: Prior, situation: Situation, move: Move) -> Window | None:
+    """Return the window that ``problem`` predicts of a move, without noise; None if its twin diverges."""
+    twin, records = problem.base_model, len(move.inputs)
+    inputs, outputs = move.inputs[:, : len(twin.inputs)], np.zeros((records, len(twin.outputs)))
+    period = situation.records * situation.sample_period / records
+    window = Window.whole(0, situation.end, period, twin.signals, np.hstack([inputs, outputs]))
+    start, initial = np.clip(known.mean[: len(problem.free)], *problem.bounds), np.zeros(len(problem.twin.states))
+    initial[: len(twin.states)] = situation.state[: len(twin.states)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        outputs = Objective(problem, window, start, initial).simulate(np.concatenate([start, initial]))
+    if not np.isfinite(outputs).all():
+        return None
+    whole = Window.whole(0, situation.end, period, twin.signals, np.hstack([inputs, outputs]))
+    return shifted(twin, whole, {signal: -delay for signal, delay in problem.delays})
 
 
 def _interval_after(problem: Problem, known: Prior, situation: Situation, move: Move) -> Array:
-    """Return the half-width (free,) of each 95 % interval after ``move``.
-
-    The initial state is estimated as well; trends are not, and what is unknown of them widens the intervals.
-    """
-    twin, kernel, free = problem.twin, kernel_of(problem.twin), len(problem.free)
-    parameters, columns = _parameter_values(problem, known.mean)
-    grid = _grid(situation, len(move.inputs))
-    with np.errstate(over="ignore", invalid="ignore"):
-        slopes = kernel.sensitivities(parameters, situation.state, Excitation(move.inputs, grid, SUBSTEPS)).slopes
-        base = len(twin.parameters) - twin.settings
-        columns += range(base, base + len(twin.states))
-        jacobian = (slopes[:, :, columns] / np.array(problem.noise)[None, :, None]).reshape(-1, len(columns))
-        information = jacobian.T @ jacobian
-    deviations = known.sd[:free]
-    if not np.isfinite(information).all():
-        return QUANTILE * deviations
-    prior = np.zeros(information.shape)
-    scaled = known.covariance[:free, :free] / np.outer(deviations, deviations)
-    prior[:free, :free] = np.linalg.inv(scaled + REGULARISATION * np.eye(free)) / np.outer(deviations, deviations)
-    total = information + prior
-    size = np.sqrt(np.maximum(np.diag(total), REGULARISATION))
-    covariance = np.linalg.pinv(total / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    drift = 0.5 * grid.length * known.sd[free:]  # from the middle of the window to its end
-    reach: Array = QUANTILE * np.sqrt(np.maximum(np.diag(covariance)[:free], 0.0) + drift**2)
-    return np.minimum(reach, QUANTILE * deviations)
+    """Return the half-width (free,) of each 95 % interval after ``move``."""
+    free, window = len(problem.free), _experiment(problem, known, situation, move)
+    if window is None:
+        return QUANTILE * known.sd[:free]
+    fitted = linearised(problem, window, known, known.mean)
+    states = (fitted.objective.high - fitted.objective.low)[free:]
+    after = information(fitted.result.first[2], np.concatenate([known.sd, states]), 1.0)
+    return QUANTILE * after.sd[:free]
 
 
-def _distance(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation, move: Move) -> float:
-    """Return χ² between the predictions after fitting ``first`` to the prediction of ``second``."""
-    noise = np.array(first.problem.noise)
-    prior = first.posterior.prior()
-    own, slopes = _prediction(first.problem, prior, situation, move)
-    other, _ = _prediction(second.problem, second.posterior.prior(), situation, move)
-    difference = ((own - other) / noise).ravel()
-    weighted = (slopes / noise[None, :, None]).reshape(len(difference), -1)
-    if not (np.isfinite(difference).all() and np.isfinite(weighted).all()):
+def _expected_evidence(wrong: TrackedHypothesis, true: TrackedHypothesis, situation: Situation, move: Move) -> float:
+    """Return the expected -2 log likelihood ratio of two hypotheses after ``move``, if ``true`` holds."""
+    window = _experiment(true.problem, true.posterior.prior(), situation, move)
+    if window is None:
         return 0.0
-    free, states = len(first.problem.free), len(first.problem.base_model.states)
-    allowed = np.sqrt(np.maximum(np.diag(prior.covariance)[:free], 0.0))
-    rows = np.vstack([weighted, np.diag(np.concatenate([1.0 / np.maximum(allowed, 1e-30), np.zeros(states)]))])
-    target = np.concatenate([difference, np.zeros(free + states)])
-    with np.errstate(over="ignore"):
-        size = np.maximum(np.linalg.norm(rows, axis=0), 1e-30)
-        if not np.isfinite(size).all():
-            return 0.0
-        solution, *_ = np.linalg.lstsq(rows / size, target, rcond=None)
-        remainder = target - rows / size @ solution
-        distance = float(remainder @ remainder)
-    return distance if np.isfinite(distance) else 0.0
+    priors = wrong.posterior.prior(), true.posterior.prior()
+    one, other = (
+        linearised(own.problem, window, prior, prior.mean) for own, prior in zip((wrong, true), priors, strict=True)
+    )
+    return chi_square_of_parameters(one) - chi_square_of_parameters(other) + _of_noise(one, other)
 
 
-def _prediction(problem: Problem, known: Prior, situation: Situation, move: Move) -> tuple[Array, Array]:
-    """Return the prediction (records, outputs) and its derivatives (records, outputs, free + states)."""
-    twin, base = problem.twin, problem.base_model
-    parameters, columns = _parameter_values(problem, known.mean)
-    records, own = len(move.inputs), len(base.inputs)
-    grid = _grid(situation, records)
-    inputs = np.zeros((records, len(twin.inputs)))
-    inputs[:, :own] = move.inputs[:, :own]
-    for column, source in enumerate(twin.inputs):
-        if source.name == ELAPSED:
-            inputs[:, column] = grid.offsets
-    states = len(base.states)
-    initial = np.zeros(len(twin.states))
-    initial[:states] = situation.state[:states]
-    with np.errstate(over="ignore", invalid="ignore"):
-        prediction = kernel_of(twin).sensitivities(parameters, initial, Excitation(inputs, grid, SUBSTEPS))
-    first_state = len(twin.parameters) - twin.settings
-    return prediction.outputs, prediction.slopes[:, :, [*columns, *range(first_state, first_state + states)]]
+def _of_noise(wrong: Fit, true: Fit) -> float:
+    """Return what the size of the innovations adds; a delay leaves it as it is."""
+    if wrong.problem.delays or true.problem.delays:
+        return 0.0
+    whitening = wrong.objective.whitening
+    whitened = whitening @ np.linalg.inv(true.objective.whitening)
+    determinants = wrong.objective.innovation_model.log_determinant - true.objective.innovation_model.log_determinant
+    return float((whitened**2).sum() - whitening.shape[0] * whitening.shape[1] + determinants)
