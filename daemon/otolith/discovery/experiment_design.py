@@ -53,21 +53,21 @@ class Move:
 
 def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[str]) -> dict[str, str]:
     """Return a sentence for each ``wanted`` parameter that some move would determine, given what is ``known``."""
-    tried = list(moves(problem, situation))
-    reaches = np.array([_interval_after(problem, known, situation, move) for move in tried]).reshape(len(tried), -1)
-    required = problem.determined_within * problem.scale
-    present = QUANTILE * known.sd
-    advice = {}
-    for index, parameter in enumerate(problem.free):
-        if parameter.name not in wanted or not tried:
-            continue
-        reach = reaches[:, index]
-        enough = np.flatnonzero(reach <= required[index])
-        best = int(enough[0]) if len(enough) else int(np.argmin(reach))
-        if reach[best] <= MIN_REDUCTION * present[index]:
-            result = f"±{reach[best]:.2g} {unit_text(parameter.unit)}{OTHER_INPUTS}"
-            advice[parameter.name] = f"{tried[best].text} would determine it to {result}"
-    return advice
+    required, present = problem.determined_within * problem.scale, QUANTILE * known.sd
+    best = {at: (present[at], "") for at, own in enumerate(problem.free) if own.name in wanted}
+    for move in moves(problem, situation):
+        searched = [at for at, (reach, _) in best.items() if reach > required[at]]
+        if not searched:
+            break
+        reaches = _interval_after(problem, known, situation, move)
+        best |= {at: (reaches[at], move.text) for at in searched if reaches[at] < best[at][0]}
+    return {
+        problem.free[
+            at
+        ].name: f"{text} would determine it to ±{reach:.2g} {unit_text(problem.free[at].unit)}{OTHER_INPUTS}"
+        for at, (reach, text) in best.items()
+        if text and reach <= MIN_REDUCTION * present[at]
+    }
 
 
 def deciding_experiment(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation) -> str:
