@@ -36,7 +36,6 @@ ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral
 MAX_LINES = 64  # of largest estimated gain, whose gain is computed
 PEAKS_OF_SPECTRUM = 8  # of largest estimated gain, whose gain a search computes
 MAX_AMPLITUDE = 1e9  # in the unit of the site
-MAX_RECORDS = 5000  # last records of a window that are searched
 SAME_SIGN = 0.8  # mean product of the signs of two sources that change their signs together
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
 
@@ -275,18 +274,11 @@ def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined
 
     While no parameter is determined or a phase is unknown, it is screened around the estimate instead. While no
     parameter is determined, it is also screened for late signals: later a delay contradicts the prediction.
-
-    Of a very long window the last records are screened, so that a search ends before the next window.
     """
-    problem, window = predicted.problem, estimated.fit.window
-    is_known = determined and not predicted.unknown_phases()
-    is_long = window.records > MAX_RECORDS and not problem.components
-    if is_known and not is_long:
+    if determined and not predicted.unknown_phases():
         return screen_fit(estimated.fit)
-    prior = predicted.prior()
-    start = prior.mean if is_known else np.array([parameter.value for parameter in estimated.parameters])
-    recent = window.since(window.records - MAX_RECORDS) if is_long else window
-    screening = screen_fit(linearised(problem, recent, prior, start))
+    start = np.array([parameter.value for parameter in estimated.parameters])
+    screening = screen_fit(linearised(predicted.problem, estimated.fit.window, predicted.prior(), start))
     if determined or (gain := _delay_gain(screening.response)) <= 0.0:
         return screening
     return replace(screening, gain=max(screening.gain, gain), always_late=True)
