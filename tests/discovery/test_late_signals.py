@@ -52,6 +52,7 @@ def assert_named(document: ReportDocument, name: str, delay: float, within: floa
     assert value == pytest.approx(delay, abs=within)
     assert low - 0.5 * (high - low) <= delay <= high + 0.5 * (high - low)
     assert document.explanations[0].reason is FaultType.TIMING
+    assert document.findings[0].condition == FaultType.TIMING
 
 
 def assert_not_wrong(document: ReportDocument, motor: Motor) -> None:

@@ -82,6 +82,7 @@ NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves errors of
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the noise is not as large as [noise] or [process_noise] says"
 NOISE_SETTING = "if the machine is well, write what was found into [noise] or [process_noise]"
+CONDITIONS = {FindingKind.SENSOR: str(FaultType.SENSOR), FindingKind.TIMING: str(FaultType.TIMING)}
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
 
@@ -436,7 +437,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
     kind, subject = _kind_and_subject(decision, test)
     text = _hypotheses_text(test)
     leading = next((item for item in test.hypotheses if item.type is FaultType.TIMING), test.best)
-    condition = AMBIGUOUS_CONDITION if test.explains_window else NOT_EXPLAINED
+    condition = CONDITIONS.get(kind, AMBIGUOUS_CONDITION) if test.explains_window else NOT_EXPLAINED
     return FindingDocument(
         id=f"{kind}/{subject}" if subject else "undecided",
         kind=kind,
@@ -446,7 +447,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
         advice=experiment,
-        setting=describe_setting(leading) if kind is FindingKind.TIMING else _corrected_value(test),
+        setting=describe_setting(leading if kind is FindingKind.TIMING else test.best) or _corrected_value(test),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
     )
 
