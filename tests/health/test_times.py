@@ -91,3 +91,9 @@ def test_dates_of_a_log_without_a_zone_are_in_that_of_the_plant(
     log.write_text(own, encoding="utf-8")
     with open_recorded(load_machine(path, with_driver=False), log) as reader:
         assert next(iter(reader.chunks())).times[0] == pytest.approx(WINTER - 4.5 * 3600.0)
+
+
+@pytest.mark.parametrize("zone", ["Mars/Olympus", "../../etc/passwd", "a\nb", "\0", "x" * 5000])
+def test_a_report_from_elsewhere_with_a_zone_that_is_unknown_here_has_times_of_this_computer(zone: str) -> None:
+    assert local_moment(WINTER, zone) == local_moment(WINTER)
+    assert local_moment(WINTER, zone).utcoffset() == local_moment(WINTER).utcoffset()

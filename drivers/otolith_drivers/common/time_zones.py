@@ -28,8 +28,15 @@ def zone_named(name: str) -> tzinfo:
 
 
 def local_moment(seconds: float, zone: str | None = None) -> datetime:
-    """Return a Unix time in a zone by its checked name; in that of this computer without one."""
-    return datetime.fromtimestamp(seconds, zone_named(zone or "")).astimezone(zone_named(zone) if zone else None)
+    """Return a Unix time in a zone; in that of this computer without one, or if it does not know the zone.
+
+    A report from elsewhere may name any zone.
+    """
+    try:
+        own = zone_named(zone) if zone else None
+    except (ValueError, OSError, KeyError):
+        own = None
+    return datetime.fromtimestamp(seconds, UTC).astimezone(own)
 
 
 def utc_seconds(text: str) -> float:
