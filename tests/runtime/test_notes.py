@@ -13,6 +13,7 @@ from otolith.cli.operation import event as command
 from otolith.cli.operation.live_table import state_lines
 from otolith.health.notes import MAX_NOTE
 from otolith.health.schema import EventChange, EventDocument
+from otolith.publishing.recorder import operator_text
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.commands import otolith
 from tests.messages import assert_says, raises_saying
@@ -112,6 +113,7 @@ def test_it_is_shown_everywhere_and_survives_a_restart(begin: Begin, monkeypatch
         "watch": table.getvalue(),
         "history": otolith("history", person.running.machine.path, "--since", "9000d", "--events").output,
         "list": person.asks("list").output,
+        "recording": operator_text(person.running.published[-1]).replace("\\", ""),
         "page": otolith("report", person.running.machine.path, "--since", "9000d", "--output", "-").output,
     }
     for name, text in shown.items():

@@ -30,6 +30,7 @@ from otolith.health.text import (
     approval_text,
     event_text,
     headline,
+    note_texts,
     probability_text,
     state_word,
     texts_in,
@@ -38,7 +39,7 @@ from otolith.health.text import (
     value_text,
     zone_of,
 )
-from otolith.health.times import in_local_time, moment_text
+from otolith.health.times import clock_in, in_local_time, moment_text
 from otolith.machine import RecordedMachine
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith.twin.definition import Input, Output
@@ -277,7 +278,7 @@ class Recording:
         for event in announcements(document):
             if event.is_hint:
                 continue  # the log of the engineer's tab has it
-            self._rows[EVENTS].append((end, (event_text(event), "ERROR" if event.is_urgent else "WARN")))
+            self._rows[EVENTS].append((end, (event_text(event), _severity(event))))
         health = document.health
         parts = {} if health is None else {"": health, **health.parts}
         for part, row in parts.items():
@@ -363,7 +364,7 @@ def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
         if parameter.status is not Status.ESTIMATED and not reasons:
             yield f"{name} {parameter.status}: {in_local_time(parameter.reason, zone)}", "INFO"
     for event in announcements(document):
-        yield event_text(event, details=True), "ERROR" if event.is_urgent else "INFO" if event.is_hint else "WARN"
+        yield event_text(event, details=True), _severity(event)
     if document.fit is not None and not document.fit.explained:
         yield "the twin does not explain the window up to the noise", "INFO"
 
@@ -397,6 +398,11 @@ def near_values(quantity: MonitoredQuantity, value: float) -> list[float]:
     return [nominal, *(limit if abs(limit - nominal) <= reach else math.nan for limit in limits)]
 
 
+def _severity(event: EventDocument) -> str:
+    """Return the level of an event in a log of Rerun, as the log of the daemon has it."""
+    return "INFO" if event.is_silent else "ERROR" if event.is_urgent else "WARN"
+
+
 def operator_text(document: ReportDocument) -> str:
     """Return in Markdown the state, what is the matter, since when, how sure, and what to do."""
     if (health := document.health) is None:
@@ -424,7 +430,8 @@ def _paragraph(event: EventDocument, worst: Level) -> str:
     what = _plain(f"{state}{say.part(event.part)}: {event.condition}")
     what = f"## {what}\n{say('since', time=moment_text(event.since, event.timezone))}"
     advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
-    return "  \n".join(filter(None, [what, advice, _plain(f"{written}{sure}")]))
+    notes = map(_plain, note_texts(event, clock_in(event.timezone)))
+    return "  \n".join(filter(None, [what, advice, _plain(f"{written}{sure}"), *notes]))
 
 
 def _plain(text: str) -> str:
