@@ -15,8 +15,8 @@ from benchmarks.motor import CONFIG, windows
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.estimation.global_search import search_window
 from otolith.estimation.information import initial_prior
-from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import SwarmSearch, estimate
@@ -91,10 +91,10 @@ def main(*, quick: bool) -> int:
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)
         kernel = median_seconds(partial(objective.linearise, guess), 200)
-        generations = search_parameters(objective, free.swarm, start, seed=1).generations
+        generations = search_window(free, record[-1], start, np.random.default_rng(1)).generations
         print(f"200 records, unknown: {', '.join(names)}, and the initial state")
         print(f"  warm {warm * 1e3:8.2f} ms   one linearisation is {kernel / warm:.1%} of it")
-        print(f"  cold {cold * 1e3:8.2f} ms   {cold / warm:.0f} x warm, {generations} generations of the swarm")
+        print(f"  cold {cold * 1e3:8.2f} ms   {cold / warm:.0f} x warm, {generations} generations of the search")
     state = initial_state("motor", "bench", problem)
     for window in record:
         state, _ = adapt(state, window)

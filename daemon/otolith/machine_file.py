@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from otolith.acquisition.samples import Check
+from otolith.estimation.problem import AlgorithmName
 from otolith.health.diagnosis import OwnRule
 from otolith.health.schema import Language
 from otolith.twin.definition import Definition
@@ -188,14 +189,23 @@ class DiscoveryTable(StrictModel):
 
 
 class SwarmTable(StrictModel):
-    """The particle swarm; the defaults are Table 2 of the paper."""
+    """The global search of a window without a prediction; the defaults are Table 2 of the paper."""
 
+    algorithm: AlgorithmName = "pso"
     size: Annotated[int, Field(ge=3, le=1000)] = 15
     generations: Annotated[int, Field(ge=1, le=100_000)] = 1000
     inertia: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.9
     cognitive: Annotated[float, Field(ge=0.0, le=4.0)] = 2.0
     social: Annotated[float, Field(ge=0.0, le=4.0)] = 2.0
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+
+    @model_validator(mode="after")
+    def _has_keys_of_its_algorithm(self) -> "SwarmTable":
+        for key in ("inertia", "cognitive", "social") if self.algorithm != "pso" else ():
+            if (value := getattr(self, key)) != type(self).model_fields[key].default:
+                own = f'{key} = {value:g} has no effect with algorithm = "{self.algorithm}"'
+                raise ValueError(f'{own}, only with "pso", the particle swarm: remove {key}')
+        return self
 
 
 class TlsTable(StrictModel):

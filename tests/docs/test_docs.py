@@ -91,6 +91,7 @@ def test_ci_calls_the_readmes_test_command() -> None:
     ("module", "absent"),
     [
         ("otolith.cli.main", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic", "asyncio"}),
+        ("otolith.adaptation.adapt", {"rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
         ("otolith.runtime.service", {"numba", "rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
     ],
 )

@@ -59,6 +59,7 @@ def test_the_example_gives_its_estimation_problem() -> None:
     assert machine.problem.noise == (0.005, 0.02)
     assert machine.records == 200
     assert any("MotorMechanical.RotorSpeed" in line for line in describe(machine))
+    assert any(line.startswith("first window") and "pso" in line and "1000" in line for line in describe(machine))
 
 
 def test_the_in_process_example_needs_no_bus() -> None:

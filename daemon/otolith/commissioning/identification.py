@@ -39,7 +39,7 @@ from otolith.commissioning.likelihood import (
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
-from otolith.estimation.minimisers import search_parameters
+from otolith.estimation.global_search import search_window
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
@@ -51,7 +51,7 @@ PROCESS_RESOLUTION = 0.125  # decades, of the initial process noise
 MIN_RECORDS = DIFFERENCE_ORDER + 1  # of a window
 MIN_SENSOR_SHARE = 0.02  # of the noise that a signal shows: floor of the sensor's level
 MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
-POOR_FIT = 5.0  # cost of the first window's fit beyond which the particle swarm looks for a better minimum
+POOR_FIT = 5.0  # cost of the first window's fit beyond which all of the bounds are searched for a better minimum
 SMALL_PROCESS_SHARE = 1e-3  # of the observable process noise: where inflation begins if the likelihood found none
 MAX_LEFT = 0.5  # of the reduced chi-square that process noise may leave where it cannot make windows consistent
 MAX_PLAUSIBLE_FACTOR = 10.0  # on process noise: beyond it, noise is hardly the cause
@@ -233,9 +233,9 @@ def _first_fits(
         progress(f"window {index + 1} of {len(windows)}")
         fit = likelihood.fit(levels, window, starts)
         if not fits and fit.cost > POOR_FIT:
-            objective = Objective(with_levels(problem, levels), window, problem.nominal)
-            swarm = search_parameters(objective, problem.swarm, problem.nominal, problem.seed)
-            fit = likelihood.fit(levels, window, [*starts, swarm.positions[0]])
+            random = np.random.default_rng(problem.seed)
+            minimum = search_window(with_levels(problem, levels), window, problem.nominal, random)
+            fit = likelihood.fit(levels, window, [*starts, minimum.parameters])
         fits.append(fit)
         starts = [problem.nominal, fit.guess[: len(problem.free)]]
     return fits

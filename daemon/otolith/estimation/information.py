@@ -61,12 +61,19 @@ class Outcome(StrEnum):
     """How the search of a window ended."""
 
     CONTINUED = "Gauss-Newton continued from the prediction"
-    AGREED = "particle swarm and Gauss-Newton reached the same point"
-    SWARM_WAS_BETTER = "the particle swarm found a better minimum than the prediction led to"
-    PREDICTION_WAS_BETTER = "the particle swarm found no better minimum than the prediction led to"
+    AGREED = "global search and Gauss-Newton reached the same point"
+    SEARCH_WAS_BETTER = "the global search found a better minimum than the prediction led to"
+    PREDICTION_WAS_BETTER = "the global search found no better minimum than the prediction led to"
+    UNREPEATED = "the global search ended before it found its best minimum again: the result is the best so far"
     AMBIGUOUS = "different parameters explain the window equally well"
     NOTHING_TO_FIND = "the window has too little information for a search"
     UNFINISHED = "the fit converged neither under the prior nor on the window alone: the result is the best so far"
+
+    @classmethod
+    def _missing_(cls, value: object) -> "Outcome | None":
+        """Return the outcome that a report of an earlier version calls by another name."""
+        former = {own.value.replace("global search", "particle swarm"): own for own in cls}
+        return former.get(str(value))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,31 +1,28 @@
-"""The two minimisers of an objective: Gauss-Newton from a guess, and a particle swarm if nothing is known.
+"""The two minimisers of an objective: Gauss-Newton from a guess, and a population of pymoo's if nothing is known.
 
 Gauss-Newton is bounded, has exact sensitivities, and is damped as by Levenberg and Marquardt (J. Nocedal, S. J. Wright,
 Numerical Optimization, 2nd ed., section 10.3; bounds by the active set).
 
-The particle swarm is that of the paper (Eq. 1-2). A generation costs one call of a compiled kernel. A swarm library's
-bookkeeping per generation costs ten times as much, so the update rule is written out here;
-``tests/estimation/test_particle_swarm.py`` compares it with pymoo's. The inertia weight falls from the paper's value:
-held fixed at 0.9, a swarm does not converge.
+The populations are pymoo's: particle swarm, differential evolution, CMA-ES, genetic algorithm (J. Blank, K. Deb, pymoo:
+multi-objective optimization in Python, IEEE Access 8, 2020). A generation is one call of a compiled kernel.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.estimation.objective import Objective
-from otolith.estimation.problem import SwarmOptions
+from otolith.estimation.problem import AlgorithmName, SwarmOptions
 
 MAX_STEPS = 40
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-7, 1e-12, 1e12
 MIN_IMPROVEMENT = 1e-6  # least decrease of χ²; above χ² = 1e6, the share 1e-12 of χ²
-FINAL_INERTIA = 0.3  # benchmarks.estimators: smaller loses valleys, larger does not converge
-INERTIA_GENERATIONS = 60  # over which the inertia weight falls
-MAX_INTEGRATOR_STEPS = 300_000_000  # in one search: some seconds
-LOG_SCALE_RATIO = 10.0  # ratio of the bounds above which a start is drawn by order of magnitude
+STALLED = 20  # generations without improvement after which a population ends
+IMPROVED = 0.9  # ratio of two squared costs, as of χ², that counts as an improvement
+FIRST_SIGMA = 0.3  # of the unit cube: standard deviation of the first population of CMA-ES, as its authors advise
+MIN_DIMENSIONS = 2  # CMA-ES needs two; a further one has no effect on the cost
 
 
 class LeastSquares(Protocol):
@@ -120,86 +117,123 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
     return step
 
 
-@dataclass(frozen=True, slots=True)
-class SwarmResult:
-    """Where the swarm stopped."""
+@dataclass(frozen=True, slots=True, eq=False)
+class PopulationMinimum:
+    """Where a population stopped."""
 
-    positions: Array  # (particles, dimensions) best position of each particle, the best particle first
-    costs: Array  # (particles,)
+    position: Array  # (dimensions,) the best of all generations
+    cost: float
     generations: int
     evaluations: int
-    converged: bool
 
 
-def particle_swarm(  # noqa: PLR0913 - the parts of an optimisation
-    cost: Callable[[Array], Array],
-    positions: Array,
-    bounds: tuple[Array, Array],
-    options: SwarmOptions,
-    random: np.random.Generator,
-    *,
-    is_converged: Callable[[Array], bool] = lambda _: False,
-) -> SwarmResult:
-    """Minimise ``cost`` from the first ``positions`` (particles, dimensions) within ``bounds``, each (dimensions,).
+Cost = Callable[[Array], Array]
+"""Costs (members,) of positions (members, dimensions), each finite: with pymoo, NaN would be the best."""
 
-    ``cost`` returns (particles,) for positions. ``is_converged`` is called with the best costs (particles,) after each
-    of the generations, of which ``options`` has the largest number.
+
+class _Record:
+    """A cost that records the best position, and counts the positions."""
+
+    def __init__(self, cost: Cost) -> None:
+        self._cost = cost
+        self.best, self.position, self.evaluations = np.inf, np.zeros(0), 0
+
+    def __call__(self, positions: Array) -> Array:
+        costs = self._cost(positions)
+        self.evaluations += len(positions)
+        index = int(costs.argmin())
+        if costs[index] < self.best:
+            self.best, self.position = float(costs[index]), positions[index].copy()
+        return costs
+
+
+def minimise(cost: Cost, first: Array, options: SwarmOptions, random: np.random.Generator) -> PopulationMinimum:
+    """Minimise ``cost`` within the unit cube from the ``first`` positions (members, dimensions).
+
+    It ends when the best cost has stalled, or with the generations of ``options``. Each generation is one call of
+    ``cost``. All random numbers follow from ``random``.
     """
-    velocity = np.zeros_like(positions)
-    best, best_cost = positions.copy(), np.full(len(positions), np.inf)
-    last = INERTIA_GENERATIONS - 1
-    generations, converged = 0, False
-    while generations < options.generations and not converged:
-        current = cost(positions)
-        better = current < best_cost
-        best = np.where(better[:, None], positions, best)
-        best_cost = np.where(better, current, best_cost)
-        leader = best[best_cost.argmin()]
-        inertia = options.inertia + (FINAL_INERTIA - options.inertia) * min(generations, last) / last
-        own, common = random.random(positions.shape), random.random(positions.shape)
-        velocity = (
-            inertia * velocity
-            + options.cognitive * own * (best - positions)
-            + options.social * common * (leader - positions)
-        )
-        positions = np.clip(positions + velocity, *bounds)
-        generations += 1
-        converged = is_converged(best_cost)
-    order = np.argsort(best_cost, kind="stable")
-    return SwarmResult(best[order], best_cost[order], generations, generations * len(positions), converged)
+    recorded = _Record(cost)
+    algorithm = _set_up(recorded, first, options, random)
+    generations, since, reference = 0, 0, np.inf
+    while generations < options.generations and since < STALLED and algorithm.has_next():
+        algorithm.next()
+        generations, since = generations + 1, since + 1
+        if recorded.best**2 < IMPROVED * reference:
+            reference, since = recorded.best**2, 0
+    return PopulationMinimum(recorded.position, recorded.best, generations, recorded.evaluations)
 
 
-def search_parameters(objective: Objective, options: SwarmOptions, start: Array, seed: int) -> SwarmResult:
-    """Return where the swarm stops within the bounds of the free parameters; ``start`` (free,) is a first position.
+def _set_up(cost: Cost, first: Array, options: SwarmOptions, random: np.random.Generator) -> Any:
+    """Return the algorithm of ``options``, which begins with the ``first`` positions.
 
-    Every particle starts its simulation at the first record; Gauss-Newton fits the initial state afterwards.
+    pymoo is imported here and nowhere else, as a window with a prediction needs no search. The import takes 0.15 s and
+    5 MB; that of CMA-ES, which loads Matplotlib, 3 s and 94 MB.
     """
-    free = objective.free
-    low, high = objective.low[:free], objective.high[:free]
-    random = np.random.default_rng(seed)
-    others = low + (high - low) * _latin_hypercube(options.size - 1, free, random)
-    first = np.clip(np.vstack([start, others]), low, high)
+    from pymoo.config import Config  # noqa: PLC0415
+    from pymoo.core.problem import Problem as PymooProblem  # noqa: PLC0415
+    from pymoo.core.termination import NoTermination  # noqa: PLC0415
 
-    def is_converged(best_cost: Array) -> bool:
-        chi_square = objective.count * best_cost**2
-        return bool(np.ptp(chi_square) <= options.tolerance * max(float(chi_square.min()), 1.0))
+    Config.warnings["not_compiled"] = False  # it would be printed, and nothing here is slower without
+    used = first.shape[1]
+    if used < MIN_DIMENSIONS:
+        first = np.hstack([first, random.random((len(first), MIN_DIMENSIONS - used))])
 
-    affordable = MAX_INTEGRATOR_STEPS // (options.size * max(objective.integrator_steps, 1))
-    limited = replace(options, generations=max(1, min(options.generations, affordable)))
-    return particle_swarm(objective.cost_of_parameters, first, (low, high), limited, random, is_converged=is_converged)
+    class UnitCube(PymooProblem):  # type: ignore[misc]  # pymoo has no types
+        def __init__(self) -> None:
+            super().__init__(n_var=first.shape[1], n_obj=1, xl=0.0, xu=1.0)
+
+        def _evaluate(self, x: Array, out: dict[str, Array], *_: object, **__: object) -> None:
+            out["F"] = cost(x[:, :used])
+
+    algorithm = ALGORITHMS[options.algorithm](first, options)
+    algorithm.setup(UnitCube(), termination=NoTermination(), seed=int(random.integers(2**31)))
+    if options.algorithm == "cmaes":  # its seed would be that of all random numbers of NumPy
+        algorithm.options |= {"seed": np.nan, "randn": lambda *shape: random.standard_normal(shape)}
+    return algorithm
 
 
-def _latin_hypercube(count: int, dimensions: int, random: np.random.Generator) -> Array:
+def _particle_swarm(first: Array, options: SwarmOptions) -> Any:
+    """Return the swarm of the paper (Eq. 1-2). The inertia weight adapts, as a swarm with a fixed 0.9 stays in motion.
+
+    Z.-H. Zhan, J. Zhang, Y. Li, H. S.-H. Chung, Adaptive particle swarm optimization, IEEE Transactions on Systems,
+    Man, and Cybernetics B 39, 2009.
+    """
+    from pymoo.algorithms.soo.nonconvex.pso import PSO  # noqa: PLC0415
+
+    return PSO(
+        pop_size=len(first), sampling=first, w=options.inertia, c1=options.cognitive, c2=options.social, adaptive=True
+    )
+
+
+def _differential_evolution(first: Array, _: SwarmOptions) -> Any:
+    from pymoo.algorithms.soo.nonconvex.de import DE  # noqa: PLC0415
+
+    return DE(pop_size=len(first), sampling=first)
+
+
+def _covariance_matrix_adaptation(first: Array, _: SwarmOptions) -> Any:
+    """Return CMA-ES from the first of the positions; it draws the others itself."""
+    from pymoo.algorithms.soo.nonconvex.cmaes import CMAES  # noqa: PLC0415
+
+    return CMAES(x0=first[0], sigma=FIRST_SIGMA, pop_size=len(first))
+
+
+def _genetic(first: Array, _: SwarmOptions) -> Any:
+    from pymoo.algorithms.soo.nonconvex.ga import GA  # noqa: PLC0415
+
+    return GA(pop_size=len(first), sampling=first)
+
+
+ALGORITHMS: dict[AlgorithmName, Callable[[Array, SwarmOptions], Any]] = {
+    "pso": _particle_swarm,
+    "de": _differential_evolution,
+    "cmaes": _covariance_matrix_adaptation,
+    "ga": _genetic,
+}
+
+
+def latin_hypercube(count: int, dimensions: int, random: np.random.Generator) -> Array:
     """Return (count, dimensions) points in the unit cube, one in each of ``count`` slices of every dimension."""
     slices = np.argsort(random.random((dimensions, count)), axis=1).T
     return (slices + random.random((count, dimensions))) / max(count, 1)
-
-
-def spread_starts(low: Array, high: Array, count: int, seed: int) -> Array:
-    """Return (count, free) starts over all of the bounds, by order of magnitude where both bounds have one sign."""
-    share = _latin_hypercube(count, len(low), np.random.default_rng(seed))
-    small, large = np.minimum(np.abs(low), np.abs(high)), np.maximum(np.abs(low), np.abs(high))
-    by_magnitude = (low * high > 0.0) & (large > LOG_SCALE_RATIO * small)
-    ratio = np.where(by_magnitude, large / np.where(by_magnitude, small, 1.0), 1.0)
-    starts: Array = np.where(by_magnitude, np.sign(high) * small * ratio**share, low + (high - low) * share)
-    return starts

@@ -6,6 +6,7 @@ The twin is augmented: it has components in its slots (Eq. 3 of the paper).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -74,18 +75,19 @@ def key_of(site: str, family: str, source: str) -> str:
     return f"{site}/{family}/{source}".rstrip("/")
 
 
+AlgorithmName = Literal["pso", "de", "cmaes", "ga"]
+
+
 @dataclass(frozen=True, slots=True)
 class SwarmOptions:
-    """Particle swarm settings (Table 2 of the paper)."""
+    """Settings of the global search (Table 2 of the paper)."""
 
+    algorithm: AlgorithmName = "pso"
     size: int = 15
     generations: int = 1000
     inertia: float = 0.9
     cognitive: float = 2.0
     social: float = 2.0
-    tolerance: float = 0.1
-    """The swarm has converged when χ² at the best positions of its particles differs by at most this share: then all
-    lie in one valley, and Gauss-Newton finds its minimum."""
 
 
 @dataclass(frozen=True, slots=True)

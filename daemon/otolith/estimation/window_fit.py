@@ -1,7 +1,7 @@
 """Step 2 of the method: from one window to parameters with their uncertainty.
 
 :func:`fit` is the one fit of a window under a prior; hypotheses use it as well. :func:`estimate` adds the fit
-of the window alone, and searches with a particle swarm where the prediction does not lead to an explanation.
+of the window alone, and searches all of the bounds where the prediction does not lead to an explanation.
 """
 
 from dataclasses import dataclass, replace
@@ -12,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Mask, Window
+from otolith.estimation.global_search import search_window
 from otolith.estimation.information import (
     MIN_SINGULAR,
     QUANTILE,
@@ -28,25 +29,13 @@ from otolith.estimation.information import (
     information,
     without_input_noise,
 )
-from otolith.estimation.minimisers import (
-    MAX_STEPS,
-    FitResult,
-    SwarmResult,
-    continued,
-    gauss_newton,
-    search_parameters,
-    spread_starts,
-)
+from otolith.estimation.minimisers import MAX_STEPS, FitResult, continued, gauss_newton
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem, amplitude_indices
 from otolith.estimation.timing import shifted, with_changes_between
 
 AT_BOUND = 1e-4  # share of the width of the bounds
-REFINED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
-REFINED_STARTS = 12  # further starts of Gauss-Newton over all of the bounds
-TRIAL_STEPS = 15  # of Gauss-Newton from each of these starts
-AFFORDABLE_STEPS = 20_000  # integrator steps of a prediction above which fewer starts are tried
 UNINFORMATIVE = 0.25  # share of the width of the bounds: standard deviation of a parameter that a window leaves open
 ALONE_STEPS = 12  # of Gauss-Newton for the window alone, which starts at the fit under the prior
 LOCAL_MINIMUM = 0.5  # ratio of χ² between two fits under one prior below which the worse one is a local minimum
@@ -234,17 +223,17 @@ class WindowEstimate:
 
 
 class SwarmSearch(Enum):
-    """When the particle swarm searches."""
+    """When all of the bounds are searched."""
 
-    NEVER = "Gauss-Newton starts at the prediction; no swarm"
-    IF_UNEXPLAINED = "a swarm searches if Gauss-Newton does not explain the window"
-    FROM_BOUNDS = "a swarm searches, unless the window is explained and determines no parameter"
+    NEVER = "Gauss-Newton starts at the prediction; no search"
+    IF_UNEXPLAINED = "a search follows if Gauss-Newton does not explain the window"
+    FROM_BOUNDS = "a search follows, unless the window is explained and determines no parameter"
 
 
 def estimate_window(predicted: Posterior, window: Window, search: SwarmSearch = SwarmSearch.NEVER) -> WindowEstimate:
     """Estimate from ``window`` under its prediction.
 
-    If no swarm may search and a phase is unknown, the fit of least cost from four starting phases is returned.
+    If no search may follow and a phase is unknown, the fit of least cost from four starting phases is returned.
     """
     problem, prior = predicted.problem, predicted.prior()
     start = np.clip(prior.mean[: len(problem.free)], *problem.bounds)
@@ -258,7 +247,7 @@ def estimate(
     """Estimate the free parameters from ``window``; ``start`` (free,) is where the fit starts.
 
     The same problem, window, prior and start give the same estimate, bit for bit. First Gauss-Newton fits the window
-    under the prior, and from there the window alone. A particle swarm follows as ``search`` says.
+    under the prior, and from there the window alone. The global search follows as ``search`` says.
     """
     fitted = fit(problem, window, prior, start)
     both = _fit_alone(fitted, fitted.result.evaluations)
@@ -348,40 +337,27 @@ def _leave_local_minimum(both: _BothFits) -> _BothFits:
 
 
 def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
-    """Search the bounds with a particle swarm; return the better fit, how the search ended, and its generations."""
+    """Search all of the bounds; return the better fit, how the search ended, and its generations."""
     fitted, problem = both.fit, both.fit.problem
-    seed = problem.seed + fitted.window.index
-    swarm = search_parameters(fitted.objective, problem.swarm, fitted.parameters, seed)
-    refined, evaluations = _refine(fitted, swarm, seed)
-    min(refined, fitted, key=lambda item: item.chi_square).set_predictor_at_end()  # the present one was made far away
-    from_swarm, from_prediction = refined.restarted(), fitted.restarted()
-    chosen = min(from_prediction, from_swarm, key=lambda item: item.chi_square)
-    evaluations += both.evaluations + swarm.evaluations
-    evaluations += from_swarm.result.evaluations + from_prediction.result.evaluations
+    random = np.random.default_rng(problem.seed + fitted.window.index)
+    minimum = search_window(problem, fitted.window, fitted.parameters, random)
+    start = fitted.map_objective.guess(minimum.parameters, minimum.initial)
+    searched = replace(fitted, result=gauss_newton(fitted.map_objective, start))
+    min(searched, fitted, key=lambda item: item.chi_square).set_predictor_at_end()  # the present one was made far away
+    from_search, from_prediction = searched.restarted(), fitted.restarted()
+    chosen = min(from_prediction, from_search, key=lambda item: item.chi_square)
+    evaluations = both.evaluations + minimum.evaluations + searched.result.evaluations
+    evaluations += from_search.result.evaluations + from_prediction.result.evaluations
     after = _fit_alone(chosen, evaluations)
-    distance = np.abs(from_swarm.parameters - from_prediction.parameters)
+    distance = np.abs(from_search.parameters - from_prediction.parameters)
     if not (distance > DISTINCT * both.information.sd[: len(distance)]).any():
         outcome = Outcome.AGREED
-    elif abs(from_swarm.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
+    elif abs(from_search.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
         outcome = Outcome.AMBIGUOUS
     else:
-        outcome = Outcome.SWARM_WAS_BETTER if chosen is from_swarm else Outcome.PREDICTION_WAS_BETTER
-    return after, outcome, swarm.generations
-
-
-def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[Fit, int]:
-    """Return the best fit from the best particles and from starts over all of the bounds, and its evaluations.
-
-    The swarm searches parameters only, from the first record on. Where an initial state is not measured, or the minimum
-    lies along a narrow line, the swarm stops early, and only Gauss-Newton reaches the minimum.
-    """
-    objective, problem = fitted.objective, fitted.problem
-    count = min(REFINED_STARTS, REFINED_STARTS * AFFORDABLE_STEPS // max(objective.integrator_steps, 1))
-    starts = (*swarm.positions[: REFINED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
-    results = [gauss_newton(objective, objective.guess(start), TRIAL_STEPS) for start in starts]
-    best, free = min(results, key=lambda result: result.chi_square), objective.free
-    final = gauss_newton(fitted.map_objective, fitted.map_objective.guess(best.guess[:free], best.guess[free:]))
-    return replace(fitted, result=final), sum(result.evaluations for result in (*results, final))
+        found = Outcome.SEARCH_WAS_BETTER if minimum.has_repeated else Outcome.UNREPEATED
+        outcome = found if chosen is from_search else Outcome.PREDICTION_WAS_BETTER
+    return after, outcome, minimum.generations
 
 
 def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstimate:

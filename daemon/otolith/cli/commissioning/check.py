@@ -105,6 +105,11 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         lines += [f"noise of {driving.name}: {noise:g} {driving.unit}"] if noise else []
     for state, noise in zip(twin.states, problem.process_noise, strict=True):
         lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
+    swarm = file.swarm
+    lines.append(
+        f"first window: global search by {swarm.algorithm}, population of {swarm.size}, at most "
+        f"{swarm.generations} generations, seed {swarm.seed}"
+    )
     endpoints = listening(file.zenoh.listen, f"{file.machine.site}.{file.machine.name}")
     _, validity = Access(file.zenoh, machine.path).settings(prefix(file.machine.site, file.machine.name), endpoints)
     lines += [f"! {warning}"] if (warning := validity.warning(datetime.now(UTC))) else []
