@@ -227,7 +227,8 @@ def _replaced(text: str, symbols: Mapping[str, str]) -> str:
 def unit(text: str) -> "pint.Unit":
     """Return the unit that ``text`` names; raise UnitNameError if it is unknown, malformed or ambiguous."""
     short = re.sub(r"\s+", " ", text.strip()).removesuffix(".").translate(SIGNS)
-    short = re.sub(r"\[(.*)\]|\(([^()]*)\)", r"\1\2", short) if short[:1] in "[(" and short[-1:] in "])" else short
+    if around := re.fullmatch(r"\[(.*)\]|\(([^()]*)\)", short):
+        short = around[1] or around[2] or ""
     whole = short.replace(" ", "")
     written = _known_name(whole) if whole else "dimensionless"
     short = short if written else _replaced(short, JOINED)

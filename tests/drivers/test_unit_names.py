@@ -204,3 +204,17 @@ def test_a_unit_is_shown_by_its_usual_symbols_and_read_back(written: str, shown:
 )
 def test_an_equation_is_shown_with_symbols_and_keeps_its_names(written: str, shown: str) -> None:
     assert equation_text(written) == shown
+
+
+@pytest.mark.parametrize(
+    ("written", "target"),
+    [
+        ("(m)/(N*m)", "1/N"),
+        ("(rad/s)/(N*m*s)", "rad/(N*m*s^2)"),
+        ("(N*m)/(A)", "N*m/A"),
+        ("((N*m))/(kg)", "m^2/s^2"),
+        ("(kg)*(m^2)", "kg*m^2"),
+    ],
+)
+def test_parentheses_hold_a_product_together(written: str, target: str) -> None:
+    assert list(factor(written, target)) == [pytest.approx(1.0), pytest.approx(0.0)]

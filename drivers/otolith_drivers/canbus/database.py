@@ -51,7 +51,12 @@ DBC_WITHOUT_NODE = re.compile(
     r'^([ \t]*(?:SG_ [^"\n]*"[^"\n]*"|BO_[ \t]+\d+[ \t]+\w+[ \t]*:[ \t]*\d+))[ \t]*$', re.MULTILINE
 )
 EXTENDED_FLAG = 1 << 31  # of an identifier in a DBC
-DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*+(?:;|\Z)", re.MULTILINE)
+# What else says how a message is read: types, multiplexers, values that are no readings, its protocol and its period.
+DBC_REST = r'\s(?:[^;"]|"[^"]*+")*+(?:;|\Z|")'  # one without an end is read once, not from each place
+DBC_ATTRIBUTE = r'"(?:VFrameFormat|GenMsgCycleTime)"'
+DBC_EXTRA = re.compile(rf"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+){DBC_REST}", re.MULTILINE)
+DBC_VALUES = re.compile(rf"^[ \t]*(?:VAL_|BA_\s+{DBC_ATTRIBUTE}\s+BO_)\s+(\d+){DBC_REST}", re.MULTILINE)
+DBC_DEFINITION = re.compile(rf"^[ \t]*BA_DEF_(?:DEF_)?\s+(?:BO_\s+)?{DBC_ATTRIBUTE}{DBC_REST}", re.MULTILINE)
 
 logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings become faults here
 
@@ -111,10 +116,10 @@ def load_database(path: Path) -> CanDatabase:
     try:
         parsed = _parse(text, kind)
     except Exception as error:  # parsers raise exceptions of many types
-        parsed, unread = _parse_each_message(text) if is_dbc else ([], {})
+        parsed, unread, lost = _parse_each_message(text) if is_dbc else ([], {}, [])
         if not parsed:
             raise ConfigurationError(f"{path}: not a CAN database: {_cause(error)}", KEY) from error
-        faults.append(DatabaseFault(f"only its messages could be read: {_cause(error)}"))
+        faults += [DatabaseFault(f"only its messages could be read: {_cause(error)}"), *lost]
         faults += [DatabaseFault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
     if excess := _excessive_work((len(row.signals), sum(abs(each.length) for each in row.signals)) for row in parsed):
         raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)
@@ -212,21 +217,41 @@ def _parse(text: str, kind: str | None) -> list[Message]:
     return database.messages
 
 
-def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str]]:
-    """The messages of a DBC that can be parsed alone, and why each of the others cannot."""
-    extras: dict[str, list[str]] = defaultdict(list)
-    for match in DBC_EXTRA.finditer(text):
-        extras[match[1]] += [match[0]] if match[0].endswith(";") else []
+def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str], list[DatabaseFault]]:
+    """The messages of a DBC that can be parsed alone, why each of the others cannot, and what is lost of the former."""
+    types, values = _by_message(DBC_EXTRA, text), _by_message(DBC_VALUES, text)
+    definitions = [match[0] for match in DBC_DEFINITION.finditer(text) if match[0].endswith(";")]
     read: list[Message] = []
     unread: dict[str, str] = {}
+    faults: list[DatabaseFault] = []
     for identifier, name, block in _dbc_messages(text):
-        alone = "\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_:", block, *extras.pop(identifier, ()), ""])
-        try:
-            read += _parse(alone, "dbc")
-        except Exception as error:  # noqa: BLE001 - as above
-            # The line number is that of the text parsed here, not of the file.
-            unread[name] = re.sub(r"at line \d+, column \d+", "at '>>!<<'", _cause(error))
-    return read, unread
+        with_types, beside = [block, *types.pop(identifier, ())], values.pop(identifier, [])
+        parsed, why = _parse_alone([*definitions, *with_types, *beside])
+        if not parsed and beside:
+            parsed, _ = _parse_alone(with_types)
+            text_of_fault = f"values of {name} that are no readings are not known: its tables cannot be read: {why}"
+            faults += [DatabaseFault(text_of_fault, name)] if parsed else []
+        read += parsed
+        if not parsed:
+            unread[name] = why
+    return read, unread, faults
+
+
+def _by_message(pattern: re.Pattern[str], text: str) -> dict[str, list[str]]:
+    """The complete statements of a DBC that ``pattern`` finds, by the identifier of their message."""
+    statements: dict[str, list[str]] = defaultdict(list)
+    for match in pattern.finditer(text):
+        statements[match[1]] += [match[0]] if match[0].endswith(";") else []
+    return statements
+
+
+def _parse_alone(statements: list[str]) -> tuple[list[Message], str]:
+    """The messages of some statements of a DBC, and why there are none."""
+    try:
+        return _parse("\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_:", *statements, ""]), "dbc"), ""
+    except Exception as error:  # noqa: BLE001 - parsers raise exceptions of many types
+        # The line number is that of the text parsed here, not of the file.
+        return [], re.sub(r"at line \d+, column \d+", "at '>>!<<'", _cause(error))
 
 
 def _cause(error: BaseException) -> str:

@@ -95,7 +95,10 @@ def _candump_time(written: str, zone: tzinfo) -> float:
 
 
 class SavvyCanLines:
-    """The frames in a CSV of SavvyCAN, whose times are in µs; raises ValueError on a line that has none."""
+    """The frames in a CSV of SavvyCAN; raises ValueError on a line that has none.
+
+    SavvyCAN writes whole µs. Other programs write this format with seconds, which have decimals.
+    """
 
     def __init__(self, lines: Iterator[str]) -> None:
         self._lines = lines
@@ -115,7 +118,7 @@ class SavvyCanLines:
             if len(data) < length:
                 raise ValueError("too few bytes")
             yield can.Message(
-                timestamp=float(row["time stamp"]) * 1e-6,
+                timestamp=float(row["time stamp"]) * (1.0 if "." in row["time stamp"] else 1e-6),
                 channel=row.get("bus"),
                 arbitration_id=int(row["id"], 16),
                 is_extended_id=row["extended"].casefold() in {"true", "1"},
@@ -280,7 +283,7 @@ class CanLogReader(Reader):
         hint = f" (it looks like {kind})" if kind not in ("", SUFFIXES.get(suffix_of(self.path))) else ""
         if self._first_bad is not None:
             place, cause = self._first_bad
-            return f": {self.place} {place}: {cause}; no frame can be used{'' if self._frames else hint}"
+            return f": {self.place} {place}: {cause}; no frame can be used{hint}"
         if not self._frames:
             return "".join([f": no frames{hint}", *(f": {line}" for line in self._cut_off())])
         wanted = ", ".join(f"0x{identifier:X}" for identifier, _ in self._decoder.identifiers())

@@ -50,6 +50,7 @@ HEAD = 1 << 14  # bytes; some hundred lines of a log
 MAX_LINES = 20  # of a log, of which one must have its format; the first may be cut off
 MIN_STEPS = 4  # times of a log, of which
 DIFFERENCE_SHARE = 0.2  # go back, or all are equal: then they are differences
+MAX_DIFFERENCE = 1e8  # s: three years; times since 1970 are longer
 
 CANDUMP = "candump -ta"
 CANDUMP_LOG = "candump -L"
@@ -66,6 +67,7 @@ TEXT_LOGS = {
     TRC: re.compile(r";\$FILEVERSION="),
 }
 """By name: how a line of a text log, or its header, begins."""
+ANOTHER_TOOL = "a CAN log of another tool: export it as candump -L writes"
 OTHERS = {
     "Vector BLF": rb"LOGG",
     "MDF (MF4)": rb"MDF ",
@@ -81,10 +83,11 @@ OTHERS = {
     "UTF-16 text": rb"(?:\xff\xfe|\xfe\xff)",
     "BUSMASTER log": rb"\*\*\*BUSMASTER",
     "candump without times: log with candump -L": rb"\w+\s+(?:[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[\d+\]\s",
-    "a CAN log of another tool: export it as candump -L writes": (
-        rb"(?i)(?>[^\n]*?\b(?:can[ _]?)?id(?:entifier)?\b)[^\n]*\b(?:dlc|length|data\w*|d0)\b"
+    ANOTHER_TOOL: (
+        rb"(?i)(?>[^\n]*?\b(?:can[ _]?)?id(?:entifier)?\b)[^\n]*\b(?:dlc|length|data\w*|[db][01])\b"
         rb"|\d+\.\d+ \d?[rt](?:11|29) |t[0-9a-f]{3}[0-8](?:[0-9a-f]{2})*\s|\d+\s+[0-9a-f]{8}\s+\d(?:\s+[0-9a-f]{2}\b)+"
     ),
+    "a trace of CODESYS, which has a block per variable: export it as a table": rb"\[key\]; ?\[value\]",
     "JSON": rb"[\[{]\s*[\"{\[]",
     "XML": rb"<\?xml",
 }
@@ -113,22 +116,28 @@ def text_log(head: bytes) -> str:
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     names = (name for line in lines[:MAX_LINES] for name, pattern in TEXT_LOGS.items() if pattern.match(line.strip()))
     name = next(names, "")
-    return DIFFERENCES if name == CANDUMP and _has_differences(lines) else name
+    back, equal = _differences(lines)
+    is_difference = (name in (CANDUMP, CANDUMP_LOG) and back) or (name == CANDUMP and equal)
+    return DIFFERENCES if is_difference else name
 
 
-def _has_differences(lines: list[str]) -> bool:
-    """Whether the times of ``candump`` are those from frame to frame."""
+def _differences(lines: list[str]) -> tuple[bool, bool]:
+    """Whether so many times of ``candump`` go back that they are those from frame to frame; whether all are equal."""
     written = [match[1] for line in lines if (match := re.match(r"\s*\((\d+\.\d+)\)", line))]
     times = list(map(float, written))
     steps = [after - before for before, after in pairwise(times)]
-    back = sum(step < 0.0 for step in steps) > DIFFERENCE_SHARE * len(steps)
-    return len(steps) >= MIN_STEPS and (back or len(set(times[1:])) == 1)
+    if len(steps) < MIN_STEPS or max(times) > MAX_DIFFERENCE:
+        return False, False
+    back = sum(step < 0.0 for step in steps)
+    return back > DIFFERENCE_SHARE * len(steps), len(set(times[1:])) == 1
 
 
 def seen(head: bytes) -> str:
     """Return the name of the format that begins with ``head``; empty if it is not known."""
     begins = (head, head.lstrip(b" \r\n"))
     other = next((name for name, start in OTHERS.items() if any(re.match(start, begin) for begin in begins)), "")
+    if not other and any(re.match(OTHERS[ANOTHER_TOOL], line.strip()) for line in head.splitlines()[:MAX_LINES]):
+        other = ANOTHER_TOOL  # its header may stand below a title
     return other or text_log(head)
 
 

@@ -8,53 +8,64 @@ without its line, lets an open quote swallow the lines below, and knows neither 
 """
 
 import codecs
-import contextlib
-import csv
 import io
+import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, tzinfo
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Any, TextIO
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import field_validator, model_validator
 
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
 from otolith_drivers.common.time_zones import zone_named
 from otolith_drivers.config_files import Range, StrictModel
-from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.errors import ConfigurationError, counted, shown
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
-from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows, seen
-from otolith_drivers.replay.table_dates import date_column, date_of, with_dates
-from otolith_drivers.units import factor, is_unit
+from otolith_drivers.replay.readers import (
+    MAX_TIME,
+    Array,
+    DataFile,
+    Integers,
+    Mask,
+    MergedReader,
+    Reader,
+    Rows,
+    seen,
+)
+from otolith_drivers.replay.table_dates import date_of, with_dates
+from otolith_drivers.replay.table_header import (
+    BLANK,
+    MAX_PREAMBLE,
+    NUMBER,
+    SECONDS,
+    TIME,
+    ColumnRequest,
+    Header,
+    TimeRequest,
+    check_length,
+    columns_called,
+    is_number,
+    read_header,
+    split_quoted,
+)
+from otolith_drivers.replay.table_times import question_of_unit, since_1970
+from otolith_drivers.units import factor
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)
 # and test_replay_tables.py (the result does not depend on it).
 CHUNK = 1 << 19  # characters read at once
-# Engineering choice: a thousand columns need some 20 000. Bounds the memory for a file without line ends.
-MAX_LINE = 100_000  # characters
 
-TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names none
-SEGMENT = "segment"  # optional column: a change of its text begins a new recording
-SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
-HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name and unit
-# Other names of the column of the time, if none is 't'; its unit also stands behind an underscore.
-TIME_NAME = re.compile(
-    r"(?:t|_?time|time[ _]?stamp|date[ _/]*(?:and )?time|(?:datum[ _/]*(?:und )?)?(?:uhr)?zeit(?:stempel)?)"
-    r"(?:_(s|ms|us))?",
-    re.IGNORECASE,
-)
+LOST_BLOCK = re.compile(rb"\0{16,}")  # what a file system leaves of a block that was not written when the power failed
 DATE = "2026-03-29T01:59:58.25Z"  # an example
-MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
 MIN_GROUPED = 10  # cells like 1.001, and whole numbers, from which on it is asked whether thousands are separated
-MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
-EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
-NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
-BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
 LAST_SIGNS = {".": r",.*\.\d*$", ",": r"\..*,\d*$"}  # of a cell with both signs
 # A number whose thousands are separated, by {} or a space: three digits alone behind the other sign may be decimals.
 THOUSANDS = (
@@ -66,61 +77,36 @@ THOUSANDS = (
 keep_pandas_out()  # only the reader of MF4 logs needs it, which imports it itself
 
 
+class TableTime(StrictModel):
+    """The column of the times of a signal; its name alone stands for a table with ``column``."""
+
+    column: str  # Of several with this name, the one before the column of the signal
+    unit: str | None = None  # Of the numbers in it, if its header does not name it
+    date: str | None = None  # Column of the dates, if this one has the time of the day only; one called Date is found
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name(cls, written: Any) -> Any:
+        return {"column": written} if isinstance(written, str) else written
+
+    @field_validator("unit")
+    @classmethod
+    def _unit_of_time(cls, unit: str | None) -> str | None:
+        if unit is not None:
+            factor(unit, SECONDS)
+        return unit
+
+
 class TableSource(StrictModel):
     """The column of a signal."""
 
     column: str | None = None  # Name of the column; without it, the name of the signal
     unit: str | None = None  # Unit of the numbers in the column, if its header does not name it
     range: Range | None = None  # In the unit of the column; a number outside is no reading
+    time: TableTime | None = None  # Without it, that of the table
 
 
 Source = TableSource  # for readers.Format
-Place = tuple[int, str | None]  # position of a column in a row, from 0, and its unit if the header has it
-
-
-class Column(NamedTuple):
-    """Position of a signal in a row, from 0; ``scale * number + offset`` is the value in the unit of the signal."""
-
-    place: int
-    scale: float = 1.0
-    offset: float = 0.0
-
-    def scaled(self, numbers: Array) -> Array:
-        """The values of ``numbers`` in the unit of the signal; infinity for one that is too large."""
-        with np.errstate(over="ignore"):
-            values: Array = self.scale * numbers + self.offset
-        return values
-
-    def written(self, limits: Range) -> Range:
-        """The numbers in the column for ``limits`` in the unit of the signal."""
-        ends = sorted((limit - self.offset) / self.scale for limit in limits)
-        return ends[0], ends[1]
-
-
-class ColumnRequest(NamedTuple):
-    """Name of a wanted column, unit of its signal, and unit of its numbers if the machine file names it."""
-
-    column: str
-    unit: str
-    written: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Header:
-    """The line with the names of the columns."""
-
-    path: Path
-    line: int  # Line number, from 1
-    separator: str
-    widths: tuple[int, int]
-    """Minimum and maximum number of cells in a row: columns without a name at the end may be absent."""
-    columns: dict[str, Column]  # Of the time and of every signal
-    segment: int | None = None  # Position of the column of segments in a row, from 0
-    below: str = ""  # The lines below it that were read and may be rows
-    others: tuple[tuple[str, int, str | None], ...] = ()
-    """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
-    beside: tuple[list[str], ...] = ()  # Cells of the lines that may have units: some below it, and the one above
-    date: int | None = None  # Position of the column of the date, if that of the time has the time of day only
 
 
 @dataclass(slots=True)
@@ -142,12 +128,35 @@ class TableCounts:
         return self.bad_rows + self.bad_cells
 
 
-def open_log(path: Path, setup: Setup, _: object = None) -> "TableReader":
+def open_log(path: Path, setup: Setup, _: object = None) -> Reader:
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
-    units = {signal.name: signal.unit for signal in setup.signals}
-    ordinary = {signal.name: signal.ordinary for signal in setup.signals if signal.ordinary is not None}
-    sources = {signal.name: signal.source for signal in setup.signals}
-    return TableReader(path, units, sources, ordinary, zone_named(setup.timezone))
+    signals = {signal.name: signal for signal in setup.signals}
+
+    def open_columns(names: Sequence[str]) -> TableReader:
+        units = {name: signals[name].unit for name in names}
+        ordinary = {name: signals[name].ordinary for name in names}
+        sources = {name: signals[name].source for name in names}
+        return TableReader(path, units, sources, ordinary, zone_named(setup.timezone))
+
+    by_time = defaultdict[str, list[str]](list)
+    for name, signal in signals.items():
+        time = signal.source.time
+        is_own = time is not None and _are_several(path, time.column)
+        by_time[f"times of {name}" if is_own else f"{time}"].append(name)
+    if len(by_time) < 2:
+        return open_columns(list(signals))
+    return MergedReader(path, by_time, lambda time: open_columns(by_time[time]))
+
+
+def _are_several(path: Path, name: str) -> bool:
+    """Whether several columns of a table have the ``name``."""
+    data = DataFile(path)
+    try:
+        text = decoded(path, data)
+        lines = list(itertools.islice(text, MAX_PREAMBLE))
+    finally:
+        data.close()
+    return any(columns_called(name, line) > 1 for line in lines)
 
 
 class TableReader(Reader):
@@ -161,10 +170,12 @@ class TableReader(Reader):
         path: Path,
         units: Mapping[str, str],
         sources: Mapping[str, TableSource] | None = None,
-        ordinary: Mapping[str, Range] | None = None,
+        ordinary: Mapping[str, Range | None] | None = None,
         zone: tzinfo = UTC,
     ) -> None:
         """``units`` has the unit of each wanted signal, ``sources`` the column of a signal that has another name.
+
+        All of them have the times of one column.
 
         ``ordinary`` has the values of each input in ordinary operation, in its unit. ``zone`` is that of dates that
         name none.
@@ -181,7 +192,9 @@ class TableReader(Reader):
         }
         try:
             self._text = decoded(path, data)
-            self._header = read_header(path, self._text, self._wanted)
+            clock = next(iter(named.values())).time if named else None
+            request = None if clock is None else TimeRequest(clock.column, clock.unit, clock.date)
+            self._header = read_header(path, self._text, self._wanted, request)
         except BaseException:
             data.close()
             raise
@@ -208,7 +221,7 @@ class TableReader(Reader):
             if end:
                 yield from self._rows(text, number)
                 number += text.count("\n") + 1
-            _check_length(f"{self.path}:{number}", len(rest))
+            check_length(f"{self.path}:{number}", len(rest))
         yield from self._rows(rest, number)
         yield from self._times.rest()
         if not self.counts.rows:
@@ -217,9 +230,11 @@ class TableReader(Reader):
     def _rows(self, text: str, first: int) -> Iterator[Rows]:
         lines = pc.list_flatten(pc.split_pattern(pa.array([text]), "\n"))
         lengths = pc.utf8_length(lines).to_numpy()
-        _check_length(f"{self.path}:{first + int(lengths.argmax())}", int(lengths.max()))
+        check_length(f"{self.path}:{first + int(lengths.argmax())}", int(lengths.max()))
         rows = _TableChunk(self._header, self.counts, self._zone, lines, first).rows(quoted='"' in text)
         if rows is not None:
+            if not self._header.is_unit_stated and (question := question_of_unit(rows.times)):
+                raise ConfigurationError(f"{self.path}: {question}")
             yield from self._times.of(rows)
 
     def _why_no_rows(self) -> str:
@@ -254,7 +269,7 @@ def decoded(path: Path, data: DataFile) -> TextIO:
     start = data.stream.peek()
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return io.TextIOWrapper(data.stream, encoding="utf-16", errors="replace")
-    if b"\0" in start:
+    if b"\0" in LOST_BLOCK.sub(b"", start) or start.startswith(b"\0"):
         kind = seen(start) or "compressed, a spreadsheet or UTF-16"
         raise ConfigurationError(f"{path}: is not text ({kind}): save it as CSV in UTF-8")
     try:
@@ -263,156 +278,6 @@ def decoded(path: Path, data: DataFile) -> TextIO:
     except UnicodeDecodeError:
         encoding = "utf-8-sig" if start.startswith(codecs.BOM_UTF8) else "cp1252"
     return io.TextIOWrapper(data.stream, encoding=encoding, errors="replace")
-
-
-def _check_length(place: str, length: int) -> None:
-    if length > MAX_LINE:
-        raise ConfigurationError(f"{place}: longer than {MAX_LINE} characters: is this a CSV file?")
-
-
-def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -> Header:
-    """The header of ``file``, which is read to the line below: the first line with the time and all wanted columns.
-
-    Raises:
-        ConfigurationError: no header, a column that is missing or not unique, or a unit of another dimension.
-    """
-    wanted = {TIME: ColumnRequest(TIME, SECONDS), **wanted}
-    number, separator, faults = 0, "", list[tuple[int, ConfigurationError]]()
-    above, commented, rows = list[str](), "", list[str]()
-    while len(faults) < MAX_PREAMBLE and (line := file.readline(MAX_LINE + 1)):
-        number += 1
-        _check_length(f"{path}:{number}", len(line))
-        is_comment = line.lstrip().startswith("#")
-        if excel := EXCEL_SEPARATOR.fullmatch(line.strip()):
-            separator = excel[1]
-        if excel or not line.strip(" #\r\n"):
-            continue
-        sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
-        cells = _split_quoted(line, sign)
-        if commented and all(is_number(cell) for cell in cells if cell):  # numpy writes names as a comment
-            number, rows, cells = number - 1, [line], _split_quoted(commented, sign)
-        elif is_comment:
-            commented = line.lstrip("# ")
-            continue
-        try:
-            places, others = _places(f"{path}:{number}", cells, wanted)
-            break
-        except ConfigurationError as error:
-            faults.append((sum(not is_number(cell) for cell in cells if cell), error))
-            above = cells
-    else:
-        empty = ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
-        raise max(faults, key=lambda fault: fault[0], default=(0, empty))[1]
-    rows += [line for _ in range(MAX_BELOW - len(rows)) if (line := file.readline(MAX_LINE + 1))]
-    split = [_split_quoted(row, sign) for row in rows]
-    units, skipped = _units_beside(above, split, wanted, places)
-    columns: dict[str, Column] = {}
-    for signal, request in wanted.items():
-        index, written = places[request.column]
-        unit = request.written or written or units.get(index)
-        try:
-            columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
-        except ValueError as error:
-            raise ConfigurationError(f"{path}:{number}: column {index + 1} ({cells[index]!r}): {error}") from error
-    named = max(index for index, cell in enumerate(cells) if cell) + 1
-    is_wanted = SEGMENT in {request.column for request in wanted.values()}
-    segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
-    widths, below = (named, len(cells)), "".join(rows[skipped:])
-    date = date_column([_name_and_unit(cell)[0] for cell in cells], split, places[TIME][0])
-    return Header(path, number + skipped, sign, widths, columns, segment, below, others, (*split, above), date)
-
-
-def _places(
-    place: str, cells: list[str], wanted: Mapping[str, ColumnRequest]
-) -> tuple[dict[str, Place], tuple[tuple[str, int, str | None], ...]]:
-    """The place of each wanted column, and of that of segments if there is one; name and place of the others."""
-    known = list(dict.fromkeys(request.column for request in wanted.values()))
-    if all(is_number(cell) for cell in cells if cell):
-        raise ConfigurationError(f"{place}: numbers, but a header must name the columns: {', '.join(known)}")
-    places: dict[str, Place] = {}
-    others, times = list[tuple[str, int, str | None]](), list[tuple[str, Place]]()
-    for index, cell in enumerate(cells):
-        name, written = _name_and_unit(cell)
-        name = cell if cell in known else name
-        if name in places:
-            raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): a second column {name}: remove one")
-        if name in known or name == SEGMENT:
-            places[name] = (index, written)
-        else:
-            others += [(name, index, written)] if name else []
-            match = TIME_NAME.fullmatch(name)
-            times += [(name, (index, written or (match[1] and match[1].lower())))] if match else []
-    if TIME not in places and times:
-        if len(times) > 1:
-            names = ", ".join(repr(cells[index]) for _, (index, _) in times)
-            raise ConfigurationError(
-                f"{place}: {names} may be the column of the time: rename one to 't [s]' or the like"
-            )
-        ((name, places[TIME]),) = times
-        others = [other for other in others if other[0] != name]
-    for request in wanted.values():
-        if request.column not in places:
-            raise ConfigurationError(f"{place}: {_missing(request, [name for name, _, _ in others], cells)}")
-    return places, tuple(others)
-
-
-def is_number(cell: str) -> bool:
-    """Whether a cell of the header or near it is a number, with either decimal sign."""
-    return re.match(NUMBER, cell.replace(",", ".")) is not None
-
-
-def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    """The name in a cell of the header, and its unit if it has one; other parentheses belong to the name."""
-    name, unit, in_parentheses = HEADER_CELL.findall(cell)[0]
-    if in_parentheses and (is_number(in_parentheses) or not is_unit(in_parentheses)):
-        return cell, None
-    return name, unit or in_parentheses or None
-
-
-def _units_beside(
-    above: list[str], below: list[list[str]], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]
-) -> tuple[dict[int, str], int]:
-    """The units in a line below the header or above it, by the position of their columns; how many are no rows."""
-    for number, cells in enumerate(below, 1):
-        if units := _units_in(cells, wanted, places):
-            return units, number
-        if any(is_number(cells[index]) for index, _ in places.values() if index < len(cells)):
-            break
-    units = _units_in(above, wanted, places)
-    return (units if all(map(is_unit, units.values())) else {}), 0
-
-
-def _units_in(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> dict[int, str]:
-    """The units in a line, by the position of their columns; empty if it seems to have none."""
-    texts, fitting = dict[int, str](), 0
-    for request in wanted.values():
-        index = places[request.column][0]
-        text = cells[index].strip("[]()") if index < len(cells) else ""
-        if is_number(text):
-            return {}
-        if re.match(BLANK, text) or (request.column == TIME and not is_unit(text)):
-            continue
-        texts[index] = text
-        with contextlib.suppress(ValueError):
-            factor(text, request.unit)
-            fitting += 1
-    is_sure = 2 * fitting > len(texts)  # single letters are units of something
-    return texts if is_sure or (2 * fitting == len(texts) and all(map(is_unit, texts.values()))) else {}
-
-
-def _missing(request: ColumnRequest, others: list[str], cells: list[str]) -> str:
-    unit = "seconds, also called 'time'" if request.column == TIME else request.unit
-    what = f"no column {request.column!r} ({unit})"
-    kind = seen(",".join(cells).encode())
-    other = f"; the file looks like {kind}" if kind else ""
-    if len(cells) < 2:
-        return f"{what}, and no ',', ';' or tab between columns{other}"
-    return f"{what}: {nearest(request.column, others) if others else 'add it'}{other}"
-
-
-def _split_quoted(line: str, separator: str) -> list[str]:
-    """The cells of one line, without spaces around them; a quote that is not closed ends with the line."""
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
 class _TableChunk:
@@ -437,13 +302,14 @@ class _TableChunk:
         signs = (_decimal_sign([text for name, text in texts.items() if name != TIME]), _decimal_sign([texts[TIME]]))
         if not counts.decimal and (cell := _ambiguous_cell([text for name, text in texts.items() if name != TIME])):
             whole = cell.replace(".", "").replace(",", "")
-            cause = f"{cell!r} may be {whole} or a number with decimals, as no other cell shows it"
+            cause = f"{shown(cell)} may be {whole} or a number with decimals, as no other cell shows it"
             raise ConfigurationError(f"{self._header.path}: {cause}: export without separated thousands")
         counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
-        times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
+        times = since_1970(columns[TIME].scaled(_numbers(texts[TIME], counts.decimal)), columns[TIME].scale)
         dates = np.flatnonzero(np.isinf(times))
         times[dates] = [date_of(text, self._zone) for text in texts[TIME].take(pa.array(dates)).to_pylist()]
-        timed = self._timed(times, texts.pop(TIME), cells, kept)
+        own = [column.place for column in columns.values()] if self._header.is_shared else None
+        timed = self._timed(times, texts.pop(TIME), _text_of(cells, own), kept)
         kept = kept[timed]
         if not len(kept):
             return None
@@ -474,7 +340,7 @@ class _TableChunk:
         separator = self._header.separator
         if not quoted:
             return pc.split_pattern(self._lines, separator)
-        return pa.array([_split_quoted(line, separator) for line in self._lines.to_pylist()], pa.list_(pa.string()))
+        return pa.array([split_quoted(line, separator) for line in self._lines.to_pylist()], pa.list_(pa.string()))
 
     def _right_width(self, cells: pa.ListArray) -> Mask:
         """Which lines are rows: a cell for each column, and no text in cells beyond them. Comments are no rows."""
@@ -492,18 +358,19 @@ class _TableChunk:
             self._count_rows(wrong, f"{widths[wrong[0]]} cells, but {most} columns{hint}")
         return fits
 
-    def _timed(self, times: Array, texts: pa.StringArray, cells: pa.ListArray, lines: Integers) -> Mask:
+    def _timed(self, times: Array, texts: pa.StringArray, has_text: Mask, lines: Integers) -> Mask:
         """Which of the rows have a time; ``lines`` are their lines. A row without any text is blank, not bad."""
         timed: Mask = np.abs(times) <= MAX_TIME
-        wrong = np.flatnonzero(~timed)
-        wrong = wrong[_has_text(cells.take(pa.array(wrong)))]
+        wrong = np.flatnonzero(~timed & has_text)
         if len(wrong):
             first, cause = wrong[0], "a row without t"
             if not np.isnan(times[first]):
                 cell = texts[int(first)].as_py()
-                cause = f"t is {cell!r}: write seconds, relative or Unix, a date like {DATE}, or the unit: 't [ms]'"
+                cause = (
+                    f"t is {shown(cell)}: write seconds, relative or Unix, a date like {DATE}, or the unit: 't [ms]'"
+                )
                 if (other := _other_sign(cell, self._counts.decimal)) and np.isinf(times[first]):
-                    cause = f"t is {cell!r}{other}"
+                    cause = f"t is {shown(cell)}{other}"
             self._count_rows(lines[wrong], cause)
         return timed
 
@@ -523,12 +390,21 @@ class _TableChunk:
             self._counts.bad_cells += len(wrong)
             cell = texts[int(wrong[0])].as_py()
             other = _other_sign(cell, self._counts.decimal)
-            self._note(int(lines[wrong[0]]), f"{name} is {cell!r}{other or ', no number'}")
+            self._note(int(lines[wrong[0]]), f"{name} is {shown(cell)}{other or ', no number'}")
 
     def _note(self, index: int, cause: str) -> None:
         line = self._first + index
         if self._counts.first_bad is None or line < self._counts.first_bad[0]:
             self._counts.first_bad = (line, cause)
+
+
+def _text_of(cells: pa.ListArray, places: list[int] | None) -> Mask:
+    """Which of the lists of cells have a text, at one of the ``places`` if they are given."""
+    if places is None:
+        return _has_text(cells)
+    texts = [pc.utf8_trim_whitespace(pc.list_element(cells, place)) for place in places]
+    mask: Mask = pc.not_equal(pc.binary_join_element_wise(*texts, ""), "").to_numpy(zero_copy_only=False)
+    return mask
 
 
 def _has_text(cells: pa.ListArray) -> Mask:

@@ -194,6 +194,28 @@ def test_broken_comments_and_attributes_are_tolerated(tmp_path: Path, after: str
     )
 
 
+@pytest.mark.parametrize(
+    ("beside", "known"),
+    [
+        ('BA_ "Nope" SG_ 385 Speed 1;', True),
+        ('CM_ "a comment with "quotes" in it";', True),
+        ('VAL_ 385 Speed 0 "Off" oops "On" ;', False),
+    ],
+)
+def test_a_fault_of_an_unused_line_leaves_values_that_are_no_readings(tmp_path: Path, beside: str, known: bool) -> None:
+    values_of_message = 'VAL_ 385 Speed 65535 "SNA; not available" ;\nBA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;'
+    after = f'{beside}\n{values_of_message}\nBA_ "GenMsgCycleTime" BO_ 385 20;'
+    database = loaded(tmp_path / "drive.dbc", dbc(MOTOR, after=after).encode())
+    (message,) = database.messages
+    (speed,) = (signal for signal in message.signals if signal.name == "Speed")
+    assert any("only its messages" in line for line in database.warnings())
+    if known:
+        assert dict(speed.conversion.choices or {}) == {65535: "SNA; not available"}
+        assert message.cycle_time == 20
+    else:
+        assert any("Motor" in line and "no readings" in line for line in database.warnings())
+
+
 def test_an_unreadable_message_does_not_affect_others(tmp_path: Path) -> None:
     text = dbc('BO_ 642 Sick: 8 Drive\n SG_ One : 0|zero@1+ (1,0) [0|0] "V" Monitor', MOTOR)
     frame_decoder = decoder(tmp_path, SPEED, text)

@@ -186,6 +186,27 @@ def test_error_remote_extended_and_fd_frames_of_candump_are_distinguished(tmp_pa
     assert f"{len(frames) + 4} frames read, 204 of other messages, 0 bad" in summary
 
 
+def test_differences_are_refused_in_the_compact_form_too(tmp_path: Path) -> None:
+    """A node that sends two frames every 10 ms, and a computer whose times scatter."""
+    generator = np.random.default_rng(1)
+    steps = [step for scatter in generator.normal(0.0, 1e-4, 100) for step in (0.0098 + scatter, 0.0002)]
+    log = "".join(f"({step:.6f}) can0 181#E803D00700000000\n" for step in steps)
+    path = tmp_path / "bus.log"
+    path.write_text(log, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="candump -td"):
+        read(path)
+
+
+def test_logs_of_other_tools_are_named_below_their_title(tmp_path: Path) -> None:
+    spy = "Spy Setup File,x\n\nLine,Abs Time(Sec),Status,Tx,Description,Arb ID,Xtd,B1,B2\n1,2,3,F,x,064,F,F0,00\n"
+    kvaser = "  Memorator Log\n  ====\n\n  Time Chan Identifier Flags DLC Data\n"
+    for name, text in (("spy.csv", spy), ("kvaser.txt", kvaser)):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigurationError, match="candump -L"), TableReader(path, {"x": "1"}) as reader:
+            list(reader.chunks())
+
+
 def test_times_that_are_differences_are_refused(tmp_path: Path, frames: Frames) -> None:
     lines, before = [], frames[0].timestamp
     for frame in frames:

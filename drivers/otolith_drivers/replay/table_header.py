@@ -1,0 +1,362 @@
+"""The header of a text table: which column has the time and which the signals, in which units, and what is asked."""
+
+import contextlib
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+import numpy as np
+
+from otolith_drivers.config_files import Range
+from otolith_drivers.errors import ConfigurationError, nearest, shown
+from otolith_drivers.replay.readers import Array, seen
+from otolith_drivers.replay.table_dates import date_column
+from otolith_drivers.replay.table_times import BESIDE_NAME, contradiction, rises_evenly
+from otolith_drivers.units import factor, is_unit
+
+# Engineering choice: a thousand columns need some 20 000. Bounds the memory for a file without line ends.
+MAX_LINE = 100_000  # characters
+TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names none
+SEGMENT = "segment"  # optional column: a change of its text begins a new recording
+SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
+HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name and unit
+# Other names of the column of the time, if none is 't'; its unit also stands behind an underscore.
+TIME_NAME = re.compile(
+    r"(?:t|_?time|time[ _]?stamp|date[ _/]*(?:and )?time|(?:datum[ _/]*(?:und )?)?(?:uhr)?zeit(?:stempel)?)"
+    r"(?:_(s|ms|us))?",
+    re.IGNORECASE,
+)
+MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
+NAME_IT = 'write time = "..." with its name for each signal under [signals]'
+BESIDE_IT = f"if each has the times of the column behind it, {NAME_IT}"
+# Names of columns in tables with one value per row, as WinCC, data loggers of PLCs and databases export them.
+NAMES_NAME = re.compile(
+    r"(?:var|variable|tag|signal|channel|entity|path|topic|_?field|_?measurement)[_ ]?(?:name|id)?", re.IGNORECASE
+)
+VALUE_NAME = re.compile(r"(?:var|tag)?[_ ]?(?:value|wert)|state", re.IGNORECASE)
+ONE_COLUMN_EACH = "export it with a column per variable, or turn it with a spreadsheet's pivot table"
+MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
+EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
+NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
+BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
+
+Place = tuple[int, str | None]  # position of a column in a row, from 0, and its unit if the header has it
+
+
+class Column(NamedTuple):
+    """Position of a signal in a row, from 0; ``scale * number + offset`` is the value in the unit of the signal."""
+
+    place: int
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def scaled(self, numbers: Array) -> Array:
+        """The values of ``numbers`` in the unit of the signal; infinity for one that is too large."""
+        with np.errstate(over="ignore"):
+            values: Array = self.scale * numbers + self.offset
+        return values
+
+    def written(self, limits: Range) -> Range:
+        """The numbers in the column for ``limits`` in the unit of the signal."""
+        ends = sorted((limit - self.offset) / self.scale for limit in limits)
+        return ends[0], ends[1]
+
+
+class ColumnRequest(NamedTuple):
+    """Name of a wanted column, unit of its signal, and unit of its numbers if the machine file names it."""
+
+    column: str
+    unit: str
+    written: str | None = None
+
+
+class TimeRequest(NamedTuple):
+    """Name of the column of the time, the unit of its numbers, and the column of the date if it has none."""
+
+    column: str = TIME
+    unit: str | None = None
+    date: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The line with the names of the columns."""
+
+    path: Path
+    line: int  # Line number, from 1
+    separator: str
+    widths: tuple[int, int]
+    """Minimum and maximum number of cells in a row: columns without a name at the end may be absent."""
+    columns: dict[str, Column]  # Of the time and of every signal
+    segment: int | None = None  # Position of the column of segments in a row, from 0
+    below: str = ""  # The lines below it that were read and may be rows
+    others: tuple[tuple[str, int, str | None], ...] = ()
+    """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
+    date: int | None = None  # Position of the column of the date in a row, from 0, if that of the time has none
+    is_shared: bool = False  # Whether other columns of a row may have times of their own
+    is_unit_stated: bool = True  # Whether that of the time is
+    beside: tuple[list[str], ...] = ()  # Cells of the lines that may have units: some below it, and the one above
+
+
+def check_length(place: str, length: int) -> None:
+    """Raise ConfigurationError if a line at ``place`` has more characters than a table needs."""
+    if length > MAX_LINE:
+        raise ConfigurationError(f"{place}: longer than {MAX_LINE} characters: is this a CSV file?")
+
+
+def read_header(
+    path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest], time: TimeRequest | None = None
+) -> Header:
+    """The header of ``file``, which is read to the lines below: the first line with the time and all wanted columns.
+
+    ``time`` names the column of the time; of several with this name it is the one before the wanted columns.
+
+    Raises:
+        ConfigurationError: no header, a column that is missing or not unique, or a unit of another dimension.
+    """
+    clock = time or TimeRequest()
+    wanted = {TIME: ColumnRequest(clock.column, SECONDS, clock.unit), **wanted}
+    number, separator, faults = 0, "", list[tuple[int, int, list[str]]]()
+    above, commented, rows, read = list[str](), "", list[str](), ""
+    while len(faults) < MAX_PREAMBLE and (line := file.readline(MAX_LINE + 1)):
+        number += 1
+        check_length(f"{path}:{number}", len(line))
+        is_comment = line.lstrip().startswith("#")
+        if excel := EXCEL_SEPARATOR.fullmatch(line.strip()):
+            separator = excel[1]
+        if excel or not line.strip(" #\r\n"):
+            continue
+        sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
+        cells = split_quoted(line, sign)
+        if commented and all(is_number(cell) for cell in cells if cell):  # numpy writes names as a comment
+            number, rows, cells = number - 1, [line], split_quoted(commented, sign)
+        elif is_comment:
+            commented = line.lstrip("# ")
+            continue
+        try:
+            places, others = _places(f"{path}:{number}", cells, wanted)
+            break
+        except ConfigurationError:
+            faults.append((sum(not is_number(cell) for cell in cells if cell), -number, cells))
+            above, read = cells, read + line
+    else:
+        if not faults:
+            raise ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
+        _, number, cells = max(faults)
+        places, others = _places(f"{path}:{-number}", cells, wanted, seen(read.encode()))
+    rows += [line for _ in range(MAX_BELOW - len(rows)) if (line := file.readline(MAX_LINE + 1))]
+    split = [split_quoted(row, sign) for row in rows]
+    units, skipped = _units_beside(above, split, wanted, places)
+    date = _place_of_date(f"{path}:{number}", clock, others)
+    if date is None:
+        date = date_column([_name_and_unit(cell)[0] for cell in cells], split, places[clock.column][0])
+    columns, is_unit_stated = _columns(f"{path}:{number}", cells, wanted, places, units)
+    named = max(index for index, cell in enumerate(cells) if cell) + 1
+    is_wanted = SEGMENT in {request.column for request in wanted.values()}
+    segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
+    beside, below, widths = (*split, above), "".join(rows[skipped:]), (named, len(cells))
+    header = Header(
+        path,
+        number + skipped,
+        sign,
+        widths,
+        columns,
+        segment,
+        below,
+        others,
+        date,
+        is_shared=time is not None,
+        is_unit_stated=is_unit_stated,
+        beside=beside,
+    )
+    if time is None and (question := _question(header, cells, split[skipped:])):
+        raise ConfigurationError(f"{path}:{number}: {question}")
+    return header
+
+
+def _place_of_date(place: str, time: TimeRequest, others: tuple[tuple[str, int, str | None], ...]) -> int | None:
+    """The position of the column with the dates; None if they are in that of the time."""
+    if time.date is None:
+        return None
+    if (at := next((index for name, index, _ in others if name == time.date), None)) is None:
+        known = [name for name, _, _ in others]
+        raise ConfigurationError(f"{place}: no column {time.date!r} (dates): {nearest(time.date, known)}")
+    return at
+
+
+def _columns(
+    place: str,
+    cells: list[str],
+    wanted: Mapping[str, ColumnRequest],
+    places: Mapping[str, Place],
+    beside: Mapping[int, str],
+) -> tuple[dict[str, Column], bool]:
+    """The column of the time and of each signal, and whether the unit of the time is stated."""
+    columns: dict[str, Column] = {}
+    is_stated = False
+    for signal, request in wanted.items():
+        index, written = places[request.column]
+        unit = request.written or written or beside.get(index)
+        is_stated |= signal == TIME and unit is not None
+        try:
+            columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
+        except ValueError as error:
+            raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {error}") from error
+    return columns, is_stated
+
+
+def columns_called(name: str, line: str) -> int:
+    """How many columns have the ``name``, if ``line`` is the header."""
+    rows = (split_quoted(line, sign) for sign in SEPARATORS)
+    return max([_name_and_unit(cell)[0] for cell in row].count(name) for row in rows)
+
+
+def _question(header: Header, cells: list[str], rows: list[list[str]]) -> str:
+    """What is asked where another column of the first ``rows`` may have the times; empty if nothing is."""
+    clock, scale, _ = header.columns[TIME]
+    rows = [row for row in rows if len(row) == len(cells) and is_number(row[clock])]
+    times = [scale * number for number in _numbers_in(rows, clock)]
+    signals = {column.place: name for name, column in header.columns.items() if name != TIME}
+    for name, index, _ in header.others:
+        if question := contradiction(cells[clock], times, name, [row[index] for row in rows]):
+            return question
+        is_beside = index > clock and index + 1 in signals and BESIDE_NAME.fullmatch(name)
+        if is_beside and rises_evenly(_numbers_in(rows, index)):
+            either = f'time = "{name}" for {signals[index + 1]}, or time = "{cells[clock]}" if it has not'
+            return f"column {shown(name)} may have the times of the column behind it: write {either}"
+    return ""
+
+
+def _numbers_in(rows: list[list[str]], index: int) -> list[float]:
+    """The numbers in a column; none if a cell is no number."""
+    texts = [row[index].replace(",", ".") for row in rows]
+    return [float(text) for text in texts] if all(map(is_number, texts)) else []
+
+
+def _places(
+    place: str, cells: list[str], wanted: Mapping[str, ColumnRequest], kind: str = ""
+) -> tuple[dict[str, Place], tuple[tuple[str, int, str | None], ...]]:
+    """The place of each wanted column, and of that of segments if there is one; name and place of the others.
+
+    ``kind`` is the format that the file seems to have, for the error.
+    """
+    known, time = list(dict.fromkeys(request.column for request in wanted.values())), wanted[TIME].column
+    if all(is_number(cell) for cell in cells if cell):
+        raise ConfigurationError(f"{place}: numbers, but a header must name the columns: {', '.join(known)}")
+    places: dict[str, Place] = {}
+    others, times, clocks = list[tuple[str, int, str | None]](), list[tuple[str, Place]](), list[Place]()
+    for index, cell in enumerate(cells):
+        name, written = _name_and_unit(cell)
+        name = cell if cell in known else name
+        match = TIME_NAME.fullmatch(name)
+        if name == time:
+            clocks.append((index, written or (match[1] and match[1].lower() if match else None)))
+        elif name in places:
+            raise ConfigurationError(f"{place}: column {index + 1} ({shown(cell)}): a second column {name}: remove one")
+        elif name in known or name == SEGMENT:
+            places[name] = (index, written)
+        else:
+            others += [(name, index, written)] if name else []
+            times += [(name, (index, written or (match[1] and match[1].lower())))] if match else []
+    if clocks:
+        places[time] = _clock(place, clocks, wanted, places)
+    elif time == TIME and times:
+        name, places[TIME] = _only(place, times, cells)
+        others = [other for other in others if other[0] != name]
+    for request in wanted.values():
+        if request.column not in places:
+            raise ConfigurationError(f"{place}: {_missing(request, [name for name, _, _ in others], cells, kind)}")
+    return places, tuple(others)
+
+
+def _only(place: str, times: list[tuple[str, Place]], cells: list[str]) -> tuple[str, Place]:
+    """The one of ``times`` that there is; raise ConfigurationError if there are several."""
+    if len(times) > 1:
+        names = ", ".join(repr(cells[index]) for _, (index, _) in times)
+        raise ConfigurationError(f"{place}: {names} may be the column of the time: rename one to 't [s]', or {NAME_IT}")
+    return times[0]
+
+
+def _clock(place: str, clocks: list[Place], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> Place:
+    """The one of several columns with the name of the time that stands before the wanted columns."""
+    at = [places[request.column][0] for request in wanted.values() if request.column in places]
+    before = {max((clock for clock in clocks if clock[0] < index), default=clocks[0]) for index in at} or set(clocks)
+    if len(before) > 1 or (len(clocks) > 1 and wanted[TIME].column == TIME):
+        name = wanted[TIME].column
+        raise ConfigurationError(
+            f"{place}: {len(clocks)} columns are called {name}: remove all but one, or {BESIDE_IT}"
+        )
+    return before.pop()
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell of the header or near it is a number, with either decimal sign."""
+    return re.match(NUMBER, cell.replace(",", ".")) is not None
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """The name in a cell of the header, and its unit if it has one; other parentheses belong to the name."""
+    name, unit, in_parentheses = HEADER_CELL.findall(cell)[0]
+    if in_parentheses and (is_number(in_parentheses) or not is_unit(in_parentheses)):
+        return cell, None
+    return name, unit or in_parentheses or None
+
+
+def _units_beside(
+    above: list[str], below: list[list[str]], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]
+) -> tuple[dict[int, str], int]:
+    """The units in a line below the header or above it, by the position of their columns; how many are no rows."""
+    for number, cells in enumerate(below, 1):
+        if units := _units_in(cells, wanted, places):
+            return units, number
+        if any(is_number(cells[index]) for index, _ in places.values() if index < len(cells)):
+            break
+    units = _units_in(above, wanted, places)
+    return (units if all(map(is_unit, units.values())) else {}), 0
+
+
+def _units_in(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> dict[int, str]:
+    """The units in a line, by the position of their columns; empty if it seems to have none."""
+    texts, fitting = dict[int, str](), 0
+    for request in wanted.values():
+        index = places[request.column][0]
+        text = cells[index].strip("[]()") if index < len(cells) else ""
+        if is_number(text):
+            return {}
+        if re.match(BLANK, text) or (request.column == TIME and not is_unit(text)):
+            continue
+        texts[index] = text
+        with contextlib.suppress(ValueError):
+            factor(text, request.unit)
+            fitting += 1
+    is_sure = 2 * fitting > len(texts)  # single letters are units of something
+    return texts if is_sure or (2 * fitting == len(texts) and all(map(is_unit, texts.values()))) else {}
+
+
+def _missing(request: ColumnRequest, others: list[str], cells: list[str], kind: str) -> str:
+    unit = "seconds, also called 'time'" if request.column == TIME else request.unit
+    what = f"no column {request.column!r} ({unit})"
+    if kind:
+        return f"{what}; the file looks like {kind}"
+    if request.column == TIME and (named := _names_of_values(cells)):
+        return f"{what}; the table seems to have one value per row, named in {named!r}: {ONE_COLUMN_EACH}"
+    twice = [name for name in dict.fromkeys(cells) if name and cells.count(name) > 1]
+    if request.unit == SECONDS and twice:
+        return f"{what}; {cells.count(twice[0])} columns are called {twice[0]!r}: {BESIDE_IT}"
+    if len(cells) < 2:
+        return f"{what}, and no ',', ';' or tab between columns"
+    return f"{what}: {nearest(request.column, others) if others else 'add it'}"
+
+
+def _names_of_values(cells: list[str]) -> str:
+    """The column with the names of a table with one value per row; empty if it has none, or none of the values."""
+    has_values = any(VALUE_NAME.fullmatch(cell) for cell in cells)
+    return next((cell for cell in cells if NAMES_NAME.fullmatch(cell)), "") if has_values else ""
+
+
+def split_quoted(line: str, separator: str) -> list[str]:
+    """The cells of one line, without spaces around them; a quote that is not closed ends with the line."""
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]

@@ -1,0 +1,83 @@
+"""The times of a table: days since 1899, and what is asked where they may mean something else.
+
+A wrong unit of the time makes every estimate wrong, without any sign of it. So a unit that is not stated is questioned
+where the rows would come faster than any logger writes, and a column of the time beside which another one contradicts.
+"""
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from datetime import UTC
+
+import numpy as np
+
+from otolith_drivers.errors import shown
+from otolith_drivers.replay.readers import Array
+from otolith_drivers.replay.table_dates import date_of
+from otolith_drivers.units import factor
+
+# Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
+SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
+DAY = 86_400.0  # s
+# Engineering choices, guarded by tests/drivers/replay/test_table_times.py.
+MIN_INTERVAL = 1e-6  # s: no logger of a machine writes rows more often, so their times are in another unit
+PLAUSIBLE = (1e-5, 3600.0)  # s between two rows, for the units that are proposed
+UNITS = {"d": "days", "h": "hours", "min": "minutes", "s": "seconds", "ms": "milliseconds"}
+ROUNDED = 1.5  # s by which a span may differ that is read from two dates without fractions of a second
+ALIKE = 0.5  # share of the longer one by which two spans of the same rows may differ
+# Names of columns that have the times of the column behind them, as TwinCAT Scope and LabVIEW write them.
+BESIDE_NAME = re.compile(r"name|x|.*(?:time|zeit).*", re.IGNORECASE)
+EVEN = 1e-3  # share by which the intervals of the first rows may differ where they are even
+
+
+def since_1970(times: Array, scale: float) -> Array:
+    """Return ``times`` (n,) in s with those of a spreadsheet, in a unit of ``scale`` s, counted from 1970."""
+    if scale != DAY or not len(times):
+        return times
+    low, high = (DAY * days for days in SPREADSHEET_DAYS)
+    finite = times[np.isfinite(times)]
+    is_counted = bool(len(finite)) and low <= float(finite.min()) and float(finite.max()) <= high
+    return times - DAY * DAYS_TO_1970 if is_counted else times
+
+
+def question_of_unit(times: Array) -> str:
+    """Return what is asked of rows at ``times`` (n,), s, whose unit is not stated; empty if nothing is."""
+    steps = np.diff(times)
+    forward = steps[steps > 0.0]
+    if not len(forward) or (interval := float(np.median(forward))) >= MIN_INTERVAL:
+        return ""
+    meanings = [
+        f"{_interval(interval * scale)} if they are {name}: write 't [{symbol}]'"
+        for symbol, name in UNITS.items()
+        if PLAUSIBLE[0] <= interval * (scale := factor(symbol, "s")[0]) <= PLAUSIBLE[1]
+    ]
+    low, high = SPREADSHEET_DAYS
+    if low <= float(times[0]) <= high:
+        meanings.sort(key=lambda text: "days" not in text)
+    question = "; or ".join(meanings) or "write its unit: 't [ms]'"
+    return (
+        f"a row every {interval:.3g} s, which is faster than any logger. The times of this table are every {question}"
+    )
+
+
+def contradiction(name: str, times: Sequence[float], other: str, cells: Sequence[str]) -> str:
+    """Return what is asked where ``cells`` of column ``other`` are dates that contradict ``times``, s; else empty."""
+    dates = [date_of(cell, UTC) for cell in cells]
+    if len(dates) < 2 or not all(map(math.isfinite, (*dates, *times))):
+        return ""
+    by_date, by_time = dates[-1] - dates[0], times[-1] - times[0]
+    if abs(by_date - by_time) <= ROUNDED + ALIKE * max(abs(by_date), abs(by_time)):
+        return ""
+    spans = f"{len(dates)} rows last {by_time:.3g} s by {shown(name)}, but {by_date:.3g} s by {shown(other)}"
+    return f'{spans}: write time = "{other}" for each signal, or time = "{name}" if that is right'
+
+
+def rises_evenly(numbers: Sequence[float]) -> bool:
+    """Return whether numbers rise in equal steps, as times do."""
+    steps = [after - before for before, after in itertools.pairwise(numbers)]
+    return len(steps) > 1 and min(steps) > 0.0 and max(steps) - min(steps) <= EVEN * max(steps)
+
+
+def _interval(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"

@@ -1,0 +1,164 @@
+"""The times of a table: named for each signal, in any unit and form, and questioned where they are improbable."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from otolith_drivers.base import Setup, Signal
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.replay.tables import TableSource, open_log
+from tests.messages import raises_saying
+
+BEGIN = 1_714_993_372.0  # 2024-05-06 11:02:52 UTC
+NAMED = {"time": "Name"}
+
+
+def samples(path: Path, **sources: dict[str, object]) -> dict[str, list[tuple[float, float]]]:
+    """Time (s) and value of each reading, by signal."""
+    signals = tuple(
+        Signal(name=name, unit="1", source=TableSource.model_validate(source)) for name, source in sources.items()
+    )
+    found = dict[str, list[tuple[float, float]]]()
+    with open_log(path, Setup(signals, path.parent, 0.01)) as reader:
+        for rows in reader.chunks():
+            for name, values in rows.columns.items():
+                present = np.isfinite(values)
+                found.setdefault(name, []).extend(
+                    zip(rows.times[present].tolist(), values[present].tolist(), strict=True)
+                )
+        assert reader.bad == 0
+    return found
+
+
+def assert_readings(found: Sequence[tuple[float, float]], times: Sequence[float], values: Sequence[float]) -> None:
+    assert [value for _, value in found] == list(values)
+    assert [time for time, _ in found] == pytest.approx(list(times))
+
+
+def table(folder: Path, header: str, rows: Sequence[str]) -> Path:
+    path = folder / "table.csv"
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def scope(folder: Path, first: str = "Name") -> Path:
+    """Two signals with times of their own, ms: 'fast' every 0.2, 'slow' every 1; both are their times."""
+    rows = [f"{row / 5}\t{row / 5}\t" + (f"{row}\t{row}" if row < 20 else "\t") for row in range(100)]
+    return table(folder, f"{first}\tfast\tName\tslow", rows)
+
+
+def test_each_signal_has_the_times_of_the_column_before_it(tmp_path: Path) -> None:
+    clock = {"column": "Name", "unit": "ms"}
+    found = samples(scope(tmp_path), fast={"time": clock}, slow={"time": clock})
+    assert (len(found["fast"]), len(found["slow"])) == (100, 20)
+    for readings in found.values():
+        assert [time for time, _ in readings] == pytest.approx([value / 1e3 for _, value in readings])
+
+
+def test_columns_with_one_name_are_asked_about(tmp_path: Path) -> None:
+    with raises_saying(ConfigurationError, "table.csv:1", "2 columns", "'Name'", 'time = "'):
+        samples(scope(tmp_path), fast={}, slow={})
+
+
+def test_a_column_that_rises_like_a_time_before_a_signal_is_asked_about(tmp_path: Path) -> None:
+    path = scope(tmp_path, "t [ms]")
+    with raises_saying(ConfigurationError, "table.csv:1", "'Name'", "slow", 'time = "Name"', 'time = "t [ms]"'):
+        samples(path, fast={}, slow={})
+    both = samples(path, fast={"time": "t [ms]"}, slow={"time": "t [ms]"})
+    assert_readings(both["slow"][5:6], [1e-3], [5.0])
+
+
+def test_a_counter_or_a_position_before_a_signal_is_no_time(tmp_path: Path) -> None:
+    path = table(tmp_path, "t,counter,position,x", [f"{row / 100},{row},{row / 10},{row}" for row in range(10)])
+    assert_readings(samples(path, x={})["x"][9:], [0.09], [9.0])
+
+
+def test_dates_that_contradict_the_times_are_asked_about(tmp_path: Path) -> None:
+    """A tag log of WinCC: ``Time_ms`` counts days since 1899, times a million."""
+    rows = [f'"n";"06.05.2024 11:02:{52 + row}";{row},00;1;{45418460324 + 11.574 * row:.2f}' for row in range(6)]
+    path = table(tmp_path, '"VarName";"TimeString";"VarValue";"Validity";"Time_ms"', rows)
+    with raises_saying(ConfigurationError, "table.csv:1", "Time_ms", "0.0463 s", "TimeString", "4 s", 'time = "'):
+        samples(path, x={"column": "VarValue"})
+    found = samples(path, x={"column": "VarValue", "time": "TimeString"})
+    assert found["x"] == [(BEGIN + row, float(row)) for row in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("unit", "step", "begin", "meaning"),
+    [
+        ("d", 0.01 / 86400, 45203.7157523148, "10 ms if they are days"),
+        ("h", 0.001 / 3600, 0.0, "1 ms if they are hours"),
+    ],
+)
+def test_rows_faster_than_any_logger_are_asked_about(
+    tmp_path: Path, unit: str, step: float, begin: float, meaning: str
+) -> None:
+    rows = [f"{begin + step * row:.11f};{row}" for row in range(20)]
+    with raises_saying(ConfigurationError, "table.csv", meaning, f"[{unit}]"):
+        samples(table(tmp_path, "t;x", rows), x={})
+    found = samples(table(tmp_path, f"t [{unit}];x", rows), x={})
+    since = np.array([time for time, _ in found["x"]])
+    assert np.diff(since) == pytest.approx(step * {"d": 86400, "h": 3600}[unit], rel=0.02)
+    if begin:  # 2023-10-04 17:10:41, counted in days since 1899
+        assert since[0] == pytest.approx(1_696_439_441.0, abs=1.0)
+
+
+def test_a_fast_table_whose_unit_is_stated_is_not_asked_about(tmp_path: Path) -> None:
+    path = table(tmp_path, "t [s];x", [f"{row * 1e-8:.10f};{row}" for row in range(20)])
+    assert samples(path, x={})["x"][19][0] == pytest.approx(1.9e-7)
+
+
+def test_date_and_time_of_day_may_stand_in_two_columns(tmp_path: Path) -> None:
+    rows = [f"06.05.2024;11:02:{52 + row / 2:06.3f};{row}" for row in range(6)]
+    path = table(tmp_path, "Datum;Uhrzeit;x", rows)
+    found = samples(path, x={"time": {"column": "Uhrzeit", "date": "Datum"}})
+    assert_readings(found["x"], [BEGIN + row / 2 for row in range(6)], list(range(6)))
+    with raises_saying(ConfigurationError, "table.csv:1", "'Tag'", "Datum"):
+        samples(path, x={"time": {"column": "Uhrzeit", "date": "Tag"}})
+
+
+@pytest.mark.parametrize("names", ["VarName", "tag", "Variable", "entity_id", "_field", "path"])
+def test_a_table_with_one_value_per_row_is_named(tmp_path: Path, names: str) -> None:
+    path = table(tmp_path, f"{names};TimeString;Value", ["U;2024-05-06 11:02:00;24.0", "N;2024-05-06 11:02:00;100"])
+    with raises_saying(ConfigurationError, "one value per row", names, "column per variable"):
+        samples(path, x={"column": "U"})
+
+
+def test_a_unit_that_measures_no_time_is_refused() -> None:
+    with pytest.raises(ValidationError, match="time"):
+        TableSource.model_validate({"time": {"column": "t", "unit": "V"}})
+
+
+@settings(max_examples=60)
+@given(
+    periods=st.lists(st.integers(1, 20), min_size=1, max_size=4),
+    ends=st.lists(st.integers(6, 40), min_size=4, max_size=4),
+    is_named=st.booleans(),
+)
+def test_any_times_beside_each_other_reach_their_signals(
+    tmp_path_factory: pytest.TempPathFactory, periods: list[int], ends: list[int], is_named: bool
+) -> None:
+    """Columns of one name or of several, of any rates and lengths: no signal has the times of another."""
+    clocks = ["Name" if is_named else f"clock{at}" for at in range(len(periods))]
+    header = ";".join(f"{clock};x{at}" for at, clock in enumerate(clocks))
+    lengths = ends[: len(periods)]
+    rows = [
+        ";".join(
+            f"{period * row};{1000 * at + row}" if row < end else ";"
+            for at, (period, end) in enumerate(zip(periods, lengths, strict=True))
+        )
+        for row in range(max(lengths))
+    ]
+    path = table(tmp_path_factory.mktemp("times"), header, rows)
+    sources: dict[str, dict[str, object]] = {
+        f"x{at}": {"time": {"column": clock, "unit": "ms"}} for at, clock in enumerate(clocks)
+    }
+    found = samples(path, **sources)
+    for at, (period, end) in enumerate(zip(periods, lengths, strict=True)):
+        values = [1000.0 * at + row for row in range(end)]
+        assert_readings(found[f"x{at}"], [1e-3 * period * row for row in range(end)], values)
