@@ -1,22 +1,28 @@
-"""The times of a table: days since 1899, and what is asked where they may mean something else.
+"""The times of a table: dates, days since 1899, and what is asked where they may mean something else.
 
 A wrong unit of the time makes every estimate wrong, without any sign of it. So a unit that is not stated is questioned
 where the rows would come faster than any logger writes, and a column of the time beside which another one contradicts.
 """
 
+import contextlib
 import itertools
 import math
 import re
 from collections.abc import Sequence
-from datetime import UTC
+from datetime import UTC, datetime, tzinfo
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
+from otolith_drivers.common.message_times import unix_time
 from otolith_drivers.errors import shown
 from otolith_drivers.replay.readers import Array
-from otolith_drivers.replay.table_dates import date_of
 from otolith_drivers.units import factor
 
+DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
+DATE_NAME = re.compile(r"datum|date", re.IGNORECASE)
+TIME_OF_DAY = re.compile(r"\s*\d{1,2}:\d\d")
 # Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
 SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
 DAY = 86_400.0  # s
@@ -29,6 +35,28 @@ ALIKE = 0.5  # share of the longer one by which two spans of the same rows may d
 # Names of columns that have the times of the column behind them, as TwinCAT Scope and LabVIEW write them.
 BESIDE_NAME = re.compile(r"name|x|.*(?:time|zeit).*", re.IGNORECASE)
 EVEN = 1e-3  # share by which the intervals of the first rows may differ where they are even
+
+
+def date_column(names: Sequence[str], rows: Sequence[Sequence[str]], time: int) -> int | None:
+    """Return the place of the column of the date, if the column at ``time`` has the time of day only; else None.
+
+    ``names`` are those of all columns, ``rows`` the cells of lines below the header.
+    """
+    places = [place for place, name in enumerate(names) if DATE_NAME.fullmatch(name)]
+    has_times = any(len(cells) > time and TIME_OF_DAY.match(cells[time]) for cells in rows)
+    return places[0] if len(places) == 1 and has_times else None
+
+
+def with_dates(dates: pa.StringArray, times: pa.StringArray) -> pa.StringArray:
+    """Return dates with times of day."""
+    return pc.binary_join_element_wise(pc.utf8_trim_whitespace(dates), pc.utf8_trim_whitespace(times), " ")
+
+
+def date_of(text: str, zone: tzinfo) -> float:
+    """Return the Unix time (s) of a date, in ``zone`` if it names none; infinity for another text."""
+    with contextlib.suppress(ValueError):
+        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")), zone)
+    return math.inf
 
 
 def since_1970(times: Array, scale: float) -> Array:

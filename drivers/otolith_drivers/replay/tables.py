@@ -40,7 +40,6 @@ from otolith_drivers.replay.readers import (
     Rows,
     seen,
 )
-from otolith_drivers.replay.table_dates import date_of, with_dates
 from otolith_drivers.replay.table_header import (
     BLANK,
     MAX_PREAMBLE,
@@ -56,7 +55,7 @@ from otolith_drivers.replay.table_header import (
     read_header,
     split_quoted,
 )
-from otolith_drivers.replay.table_times import question_of_unit, since_1970
+from otolith_drivers.replay.table_times import date_of, question_of_unit, since_1970, with_dates
 from otolith_drivers.units import factor
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)
