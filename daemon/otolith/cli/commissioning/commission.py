@@ -102,6 +102,8 @@ def commission_log(file: Path, data: Path, windows: int, *, approve_all: bool, w
     with store.locked():
         if write:
             machine = _with_own_values(machine, HealthyLog(data), windows)
+        elif names := [row.name for row in machine.twin.parameters if row.part and row.name not in _stated(machine)]:
+            echo(f"{machine.path}: {', '.join(names)}: values of the twin's example; --write determines them", err=True)
         _commission(machine, store, HealthyLog(data), windows, approve_all=approve_all, write=write)
 
 
@@ -114,8 +116,7 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
     from otolith.twin.unmeasured import Assumption
     from otolith_drivers.errors import ConfigurationError, counted
 
-    stated = {name for name, table in machine.file.parameters.items() if table.value is not None}
-    rows = [row for row in machine.twin.parameters if row.name not in stated and row.role is not Role.SETTING]
+    rows = [row for row in machine.twin.parameters if row.role is not Role.SETTING and row.name not in _stated(machine)]
     loads = {item.name for item in machine.unmeasured if item.assumption is Assumption.CONSTANT}
     free = [row for row in rows if row.part or row.role is Role.ESTIMATED]
     if not {row.name for row in free} - loads:
@@ -136,6 +137,11 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
         echo(f"of the design, as in the twin's example: {', '.join(rest)}: write what your machine has", err=True)
     echo(f"{machine.path}: {counted(len(lines), 'value')} written into [parameters]", err=True)
     return _written(machine, lambda text: with_keys(text, "parameters", lines))
+
+
+def _stated(machine: "LoadedMachine") -> set[str]:
+    """Return the parameters whose values the file states."""
+    return {name for name, table in machine.file.parameters.items() if table.value is not None}
 
 
 def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "tuple[dict[str, NewLine], list[str]]":
