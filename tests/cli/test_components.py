@@ -20,6 +20,7 @@ from otolith.adaptation.state import (
     restore_components,
 )
 from otolith.cli.commissioning import commission as command
+from otolith.cli.commissioning.commission import asked as asked_about
 from otolith.cli.main import cli
 from otolith.estimation.problem import key_of
 from otolith.machine import load_machine
@@ -126,6 +127,10 @@ def test_commission_approve_reject_and_forget(commissioned: tuple[str, str]) -> 
         restore_components(initial_state("m", "s", machine.problem), store().components()), store().decisions()
     )
     assert [component.key for component in state.problem.components] == [KEY]
+
+    records = store().components()
+    assert asked_about(machine, records, decide=lambda: None) == (set(), set())  # nobody was there to be asked
+    assert asked_about(machine, records, decide=lambda: True) == ({KEY}, set())
 
     otolith("components", "reject", MACHINE, KEY)
     assert store().decisions() == OperatorDecisions(rejected=frozenset({KEY}))

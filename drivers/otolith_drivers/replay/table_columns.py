@@ -22,7 +22,8 @@ def offered_columns(path: Path) -> list[OfferedColumn]:
     """The columns of the table at ``path`` whose names are unique; raise ConfigurationError if it has no header."""
     data = DataFile(path)
     try:
-        header = read_header(path, decoded(path, data), {})
+        text = decoded(path, data)  # closed with the file: alone it would close it with a warning
+        header = read_header(path, text, {})
     finally:
         data.close()
     beside = next((units for units in map(_units_of, header.beside) if units), {})

@@ -36,6 +36,9 @@ REPORTS_AT_ONCE = 1000  # that are read from the history
 MORE_MOTION = "record more changes of speed and load, or set the baseline later by 'otolith baseline'"
 
 
+Decide = Callable[[], bool | None]  # Whether a component belongs to the healthy machine; None: it is left open
+
+
 @click.command()
 @MACHINE_FILE
 @click.argument("data", type=FILE, required=False)
@@ -84,18 +87,23 @@ def commission(
     if last and since:
         raise click.UsageError("--last and --since both say where it begins: give one of them")
     if data is not None:
-        commission_log(file, data, windows, approve_all=yes, write=write)
+        commission_log(file, data, windows, decide=(lambda: True) if yes else ask_if_healthy, write=write)
         return
     end = until.before(time.time()) if until else time.time()
     begin = (last or since or Since()).before(end if last else time.time())
     if begin >= end:
         raise click.UsageError(f"it begins at {local_time(begin)}, but ends at {local_time(end)}")
     machine, store = loaded(file)
-    _commission_running(machine, store, (begin, end), windows, approve_all=yes, write=write)
+    _commission_running(
+        machine, store, (begin, end), windows, decide=(lambda: True) if yes else ask_if_healthy, write=write
+    )
 
 
-def commission_log(file: Path, data: Path, windows: int, *, approve_all: bool, write: bool) -> None:
-    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``."""
+def commission_log(file: Path, data: Path, windows: int, *, decide: Decide, write: bool) -> None:
+    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``.
+
+    ``decide`` is asked of each component that was found.
+    """
     from otolith.cli.commissioning.noise import HealthyLog
 
     machine, store = loaded(file)
@@ -104,7 +112,7 @@ def commission_log(file: Path, data: Path, windows: int, *, approve_all: bool, w
             machine = _with_own_values(machine, HealthyLog(data), windows)
         elif names := [row.name for row in machine.twin.parameters if row.part and row.name not in _stated(machine)]:
             echo(f"{machine.path}: {', '.join(names)}: values of the twin's example; --write determines them", err=True)
-        _commission(machine, store, HealthyLog(data), windows, approve_all=approve_all, write=write)
+        _commission(machine, store, HealthyLog(data), windows, decide=decide, write=write)
 
 
 def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int) -> "LoadedMachine":
@@ -237,7 +245,7 @@ def _commission(
     data: "HealthyData",
     windows: int,
     *,
-    approve_all: bool,
+    decide: Decide,
     write: bool,
 ) -> None:
     from otolith.adaptation.state import ComponentRecord
@@ -265,7 +273,7 @@ def _commission(
             echo("# this process noise contains the components below: keep that of the file if you approve them")
         else:
             echo("# put these tables into the machine file in place of its own, or let --write do it", err=True)
-    _review(machine, store, state, components, approve_all=approve_all)
+    _review(machine, store, state, components, decide=decide)
     try:
         keep_baseline(machine, store, state.health.histories, advice)
     except OtolithError as error:  # nothing that has limits, or a record that is too short
@@ -304,7 +312,7 @@ def _review(
     state: "AdaptationState",
     pooled: "tuple[ComponentRecord, ...]",
     *,
-    approve_all: bool,
+    decide: Decide,
 ) -> None:
     """Ask for a decision on each component, keep the approved ones, and print the estimated parameters.
 
@@ -315,7 +323,7 @@ def _review(
 
     precise = {key_of_record(record): record for record in pooled}
     records = tuple(precise.get(key_of_record(record), record) for record in component_records(state))
-    approved, rejected = _asked(machine, records, approve_all=approve_all)
+    approved, rejected = asked(machine, records, decide=decide)
     if store.components_path.exists():
         echo(f"what was learned before is kept as {store.set_aside()}", err=True)
     store.save_components(tuple(record for record in records if key_of_record(record) in approved))
@@ -329,14 +337,21 @@ def _review(
             echo(f"{parameter.name} = {interval_text(mean, variance**0.5, parameter.unit)}", err=True)
 
 
-def _asked(
-    machine: "LoadedMachine", records: "Sequence[ComponentRecord]", *, approve_all: bool
+def asked(
+    machine: "LoadedMachine", records: "Sequence[ComponentRecord]", *, decide: Decide
 ) -> tuple[set[str], set[str]]:
     """Return the keys of the components that belong to the healthy machine, and of those that do not."""
     approved, rejected = set[str](), set[str]()
     for record in records:
         echo(f"found {key_of_record(record)}: {equation_of(machine, record)}", err=True)
-        (approved if approve_all or _is_healthy() else rejected).add(key_of_record(record))
+        if (answer := decide()) is None:
+            echo(
+                "it may also be a fault, or a signal that is late ('otolith noise'): nobody was asked, and it is",
+                err=True,
+            )
+            echo(f"not approved: 'otolith commission {machine.path} DATA' asks", err=True)
+        else:
+            (approved if answer else rejected).add(key_of_record(record))
     return approved, rejected
 
 
@@ -346,7 +361,8 @@ def _decide(store: "StateStore", approved: set[str], rejected: set[str]) -> None
     store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
 
 
-def _is_healthy() -> bool:
+def ask_if_healthy() -> bool:
+    """Ask a person whether a component belongs to the healthy machine; raise Abort without an answer."""
     try:
         return click.confirm(
             "does it belong to the healthy machine? (n rejects it: it is not searched for again)", err=True
@@ -362,7 +378,7 @@ def _commission_running(
     span: tuple[float, float],
     windows: int,
     *,
-    approve_all: bool,
+    decide: Decide,
     write: bool,
 ) -> None:
     """Commission by what a daemon has recorded and estimated from the first time of ``span`` to the second."""
@@ -389,7 +405,7 @@ def _commission_running(
             echo(*noise_lines(machine, record.noise), *delay_lines(machine, record.delays))
     known = store.decisions()
     records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
-    approved, rejected = _asked(machine, records, approve_all=approve_all)
+    approved, rejected = asked(machine, records, decide=decide)
     if records:
         _decide(store, approved, rejected)
     if machine.file.parameters == before.file.parameters:

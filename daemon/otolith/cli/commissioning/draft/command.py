@@ -138,14 +138,17 @@ def _finish(
     file: Path, source: "OfferedSource", answers: "Answers", questions: Questions, *, commissions: bool
 ) -> None:
     """Write the file, commission the machine by its log if that is wanted, and name the next command."""
-    from otolith.cli.commissioning.commission import WINDOWS, commission_log
+    from otolith.cli.commissioning.commission import WINDOWS, ask_if_healthy, commission_log
     from otolith.cli.commissioning.draft.choosing import next_lines, write_draft
 
     if commissions and not source.check:
         raise click.UsageError("--commission needs a log: --csv, or --dbc with --log")
     write_draft(file, source, answers, questions)
     if commissions:
-        commission_log(file, Path(source.check), WINDOWS, approve_all=not questions.asks, write=True)
+        decide = (
+            ask_if_healthy if questions.asks else lambda: None
+        )  # what nobody was asked is no part of a healthy machine
+        commission_log(file, Path(source.check), WINDOWS, decide=decide, write=True)
     echo(*next_lines(file, source, is_commissioned=commissions))
 
 
