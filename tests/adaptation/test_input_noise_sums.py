@@ -21,6 +21,7 @@ RUNS, WINDOWS = 4, 40
 (LOAD_NOISE,) = (machine.load_noise for machine in MACHINES if machine.plant.name == "two_mass")
 
 
+@pytest.mark.full
 def test_noise_of_a_load_is_learned_and_intervals_hold_the_truth() -> None:
     """Without it, windows of a healthy machine differ by more than they state: false steps are seen."""
     (case,) = cases(WINDOWS, ["two_mass: load noise"])

@@ -80,14 +80,14 @@ def test_estimates_without_trends_of_a_parameter_on_a_fast_ramp_are_no_step() ->
     assert coverage([report.parameters["D_l"] for report in late]).reaches(0.9)
 
 
-@pytest.mark.parametrize("runs", [1, pytest.param(2, marks=pytest.mark.full)])
-def test_a_parameter_that_moved_along_a_ramp_and_stopped_is_no_component(runs: int) -> None:
+@pytest.mark.full
+def test_a_parameter_that_moved_along_a_ramp_and_stopped_is_no_component() -> None:
     """What follows the ramp contradicts its end; that the parameter has moved is still a hypothesis."""
     window = PUMP.records * PUMP.period
     ramp = Change(ramps={"T_c": -0.03}, since=6 * window)
     stopped = Change(parameters={"T_c": (1.0 - 0.03 * 2 * window) * PUMP.parameters["T_c"]})
     case = Case("stops", PUMP, ramp, healthy=6, changed=9, later=((8, stopped),))
-    for reports in observe(case, range(runs), 1):
+    for reports in observe(case, range(2), 1):
         late = reports[8:]
         assert all(report.components == () and report.decision is not WindowDecision.SENSOR for report in reports)
         assert all(report.parameters["T_c"].holds_truth for report in late), [item.parameters["T_c"] for item in late]

@@ -151,7 +151,7 @@ MISSTATED_SEEDS = often([1], range(1, 6))
 @pytest.mark.parametrize(
     ("plant", "free", "noise", "factors"),
     [
-        (SERVO_AXIS, (), AXIS_NOISE, (0.1, 0.3)),
+        pytest.param(SERVO_AXIS, (), AXIS_NOISE, (0.1, 0.3), marks=pytest.mark.full),
         pytest.param(SERVO_AXIS, (), AXIS_NOISE, (0.1, 10.0), marks=pytest.mark.full),
         pytest.param(SERVO_AXIS, (), AXIS_NOISE, (10.0, 0.1), marks=pytest.mark.full),
         (DC_MOTOR, ("R_a", "D"), MOTOR_NOISE, (0.1, 0.3)),
