@@ -9,6 +9,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.commissioning.own_values import OwnValue, OwnValues, own_values
 from otolith.estimation.problem import Problem
+from otolith.estimation.timing import shifted
 from otolith.machine import find_twin
 from otolith.twin.definition import Definition, Role
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
@@ -100,3 +101,20 @@ def test_without_a_window_nothing_is_found() -> None:
     values = found(find_twin("dc_motor"), [], set())
     assert not values.is_followed
     assert values.values == ()
+
+
+@pytest.mark.parametrize(
+    "late",
+    [{"omega": 0.01}, *(pytest.param(each, marks=pytest.mark.full) for each in ({"i": 0.02}, {"omega": 0.017}, {}))],
+    ids=lambda late: "".join(late) or "none",
+)
+def test_a_signal_that_is_late_does_not_bias_the_values(
+    motor: MotorScenario, windows: Cut, late: dict[str, float]
+) -> None:
+    whole = find_twin("dc_motor")
+    twin = without_sensor(whole, UnmeasuredInput("T_load", Assumption.CONSTANT))
+    early = {name: -delay for name, delay in late.items()}
+    recorded = [shifted(whole, window, early) for window, _ in windows(motor, 8)]
+    rows = by_name(found(twin, recorded, {"T_load"}))
+    for name in set(TRUE) - {"K_t"}:
+        assert rows[name].value == pytest.approx(TRUE[name], rel=0.03), name

@@ -8,6 +8,9 @@ have less, until only what the signals show of it is left.
 What the data determine only in combination is not guessed: a parameter that the weakest direction moves most keeps its
 stated value, or is taken as equal to one that the twin's example has with the same value, bounds and dimension, as the
 two constants of a DC motor are. Then the others are fitted again.
+
+A signal that is late biases the values. So delays of all signals are fitted with the values, and taken off the samples
+where that makes the record decisively more likely.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -18,10 +21,12 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import sample_noise, usable_windows, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
+from otolith.estimation.timing import delay_response, delayable, largest_delay, shifted
 from otolith.twin.definition import Definition, Parameter
 from otolith_drivers.units import to_base
 
@@ -29,6 +34,7 @@ from otolith_drivers.units import to_base
 WIDER = 1000.0  # times the example's values: how far a machine may be from it
 FITTED_WINDOWS = 12  # in which the outputs move most
 STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would be a random walk
+MAX_ROUNDS = 4  # of values and delays in turn
 STAGE_STEPS, LAST_STEPS = 12, 40  # of Gauss-Newton
 DETERMINED = 0.1  # share of a value that its 95 % interval may have, so that it is taken
 FOLLOWED = 30.0  # cost up to which the twin describes the machine; the noise of a fit with less is not known yet
@@ -79,8 +85,24 @@ def own_values(
     wide = replace(problem, known=tuple(known), free=tuple(map(widened, free)), open_loop=False)
     usable = sorted(usable_windows(problem, windows), key=lambda window: -_movement(problem.base_model, window))
     chosen = usable[:FITTED_WINDOWS]
+    if not chosen:
+        return OwnValues((), {}, np.inf, 0)
+    late = np.zeros(len(delayable(wide.base_model)))
     search = _ValueSearch(wide, sorted(chosen, key=lambda window: window.start), frozenset(loads), progress)
-    return search.run() if chosen else OwnValues((), {}, np.inf, 0)
+    best = search.run()
+    for _ in range(MAX_ROUNDS if best.is_followed else 0):  # a late signal biases the values, and they the delays
+        more = search.delays()
+        if not more.any():
+            break
+        late += more
+        given = dict(zip(delayable(wide.base_model), late.tolist(), strict=True))
+        moved = [shifted(wide.twin, window, given) for window in chosen]
+        search = _ValueSearch(wide, sorted(moved, key=lambda window: window.start), frozenset(loads), progress)
+        found = search.run()
+        if search.gain(best.cost, found.cost) <= DECISIVE:
+            break
+        best = found
+    return best
 
 
 def _movement(twin: Definition, window: Window) -> float:
@@ -115,10 +137,20 @@ class _Scale:
 
 
 class _Together:
-    """Residuals of all windows by shared parameters, then by what each window has of its own."""
+    """Residuals of all windows by shared parameters, then by what each window has of its own, then by delays."""
 
-    def __init__(self, objectives: Sequence[Objective], shared: Mapping[str, Sequence[int]], problem: Problem) -> None:
-        """``shared`` has the places of each searched parameter among the free ones: two if one is equal to it."""
+    def __init__(
+        self,
+        objectives: Sequence[Objective],
+        shared: Mapping[str, Sequence[int]],
+        problem: Problem,
+        largest_delay: float = 0.0,
+    ) -> None:
+        """``shared`` has the places of each searched parameter among the free ones: two if one is equal to it.
+
+        Delays of the signals up to ``largest_delay`` (s) are fitted as well; that is also their standard deviation, as
+        only their differences show. Without it there are none.
+        """
         self._objectives, self._places = objectives, [list(places) for places in shared.values()]
         self.scales = [_Scale(problem.free[places[0]]) for places in self._places]
         taken = {place for places in self._places for place in places}
@@ -126,15 +158,20 @@ class _Together:
         self._own = [place for place in range(width) if place not in taken]
         low = [scale.inside(scale.parameter.low) for scale in self.scales]
         high = [scale.inside(scale.parameter.high) for scale in self.scales]
-        self.low = np.concatenate([low, *(objective.low[self._own] for objective in objectives)])
-        self.high = np.concatenate([high, *(objective.high[self._own] for objective in objectives)])
+        self._limits = np.full(len(delayable(problem.base_model)) if largest_delay else 0, largest_delay)
+        self.low = np.concatenate([low, *(objective.low[self._own] for objective in objectives), -self._limits])
+        self.high = np.concatenate([high, *(objective.high[self._own] for objective in objectives), self._limits])
 
     def joined(self, guesses: Sequence[Array]) -> Array:
         """Return the common guess of guesses of the windows, whose shared values are those of the first."""
         first = [
             scale.inside(float(guesses[0][places[0]])) for scale, places in zip(self.scales, self._places, strict=True)
         ]
-        return np.concatenate([first, *(guess[self._own] for guess in guesses)])
+        return np.concatenate([first, *(guess[self._own] for guess in guesses), np.zeros(len(self._limits))])
+
+    def delays(self, guess: Array) -> Array:
+        """Return those of the signals, s, as outputs and then inputs."""
+        return guess[len(guess) - len(self._limits) :]
 
     def split(self, guess: Array) -> list[Array]:
         """Return the guess of each window."""
@@ -151,7 +188,7 @@ class _Together:
 
     def linearise(self, guess: Array) -> tuple[Array, Array]:
         """See :class:`otolith.estimation.minimisers.LeastSquares`."""
-        count, residuals, rows = len(self.scales), [], []
+        count, residuals, rows, delays = len(self.scales), list[Array](), list[Array](), self.delays(guess)
         slopes = [scale.slope(float(number)) for scale, number in zip(self.scales, guess, strict=False)]
         for number, (objective, own) in enumerate(zip(self._objectives, self.split(guess), strict=True)):
             errors, jacobian = objective.linearise(own)
@@ -160,9 +197,25 @@ class _Together:
                 whole[:, column] = slope * jacobian[:, places].sum(axis=1)
             begin = count + number * len(self._own)
             whole[:, begin : begin + len(self._own)] = jacobian[:, self._own]
+            if len(delays):
+                whole[:, len(guess) - len(delays) :] = response = delay_response(objective, own)
+                errors = errors + response @ delays
             residuals.append(errors)
             rows.append(whole)
+        if len(delays):
+            residuals.append(delays / self._limits)
+            rows.append(np.hstack([np.zeros((len(delays), len(guess) - len(delays))), np.diag(1.0 / self._limits)]))
         return np.concatenate(residuals), np.concatenate(rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """What all windows are fitted with, and where the fit begins."""
+
+    problem: Problem
+    shared: Mapping[str, Sequence[int]]  # See _Together
+    parameters: Array  # (free,)
+    guesses: Sequence[Array]  # Of the windows; none before the first stage
 
 
 class _ValueSearch:
@@ -171,6 +224,7 @@ class _ValueSearch:
         self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
         self._fixed: dict[str, str] = {}  # Not determined, and why
         self._equal: dict[str, str] = {}  # Taken as equal to another one
+        self._last: tuple[_Stage, float] | None = None  # with its cost
 
     def run(self) -> OwnValues:
         """Fit, and hold what is not determined, until all others are."""
@@ -189,6 +243,24 @@ class _ValueSearch:
         }
         return OwnValues(self._values(values, sd), loads, cost, len(self._windows))
 
+    def delays(self) -> Array:
+        """Return by how much the signals are late (s) where that shows beside the values; zeros where it does not."""
+        none = np.zeros(len(delayable(self._problem.base_model)))
+        if self._last is None:
+            return none
+        stage, cost = self._last
+        self._progress("delays of the signals")
+        largest = min(largest_delay(window.grid.length, window.sample_period) for window in self._windows)
+        _, result, together = self._fit(stage, LAST_STEPS, largest)
+        late = together.delays(result.guess)
+        is_shown = np.abs(late).max() < largest and self.gain(cost, _cost(result)) > DECISIVE
+        return late - np.median(late) if is_shown else none
+
+    def gain(self, before: float, after: float) -> float:
+        """Return by how much -2 log likelihood falls where the cost does; the level of the noise is free."""
+        count = sum(int(np.count_nonzero(~window.missing)) for window in self._windows)
+        return 2.0 * count * float(np.log(before / after)) if 0.0 < after < before else 0.0
+
     def _shared(self) -> dict[str, list[int]]:
         """Return the places of each parameter that is searched and the windows share."""
         shared = {
@@ -205,7 +277,7 @@ class _ValueSearch:
         parameters = self._problem.free
         for name in weakest:
             mine = parameters[self._places[name]]
-            for other in values.keys() - set(weakest):
+            for other in (item for item in values if item not in weakest):
                 is_determined = QUANTILE * sd[other] <= DETERMINED * abs(values[other])
                 if is_determined and _are_alike(mine, parameters[self._places[other]]):
                     self._equal[name] = other
@@ -234,37 +306,33 @@ class _ValueSearch:
         for share in STAGES:
             self._progress(f"values of {len(shared)} parameters, stage {STAGES.index(share) + 1} of {len(STAGES) + 1}")
             staged = with_levels(problem, np.concatenate([noise, share * walk]))
-            guesses, _, _ = self._stage(staged, moved, parameters, guesses, STAGE_STEPS)
+            guesses, _, _ = self._fit(_Stage(staged, moved, parameters, guesses), STAGE_STEPS)
             parameters = guesses[0][: len(parameters)]
         self._progress(f"values of {len(shared)} parameters, last stage")
         there = replace(problem, free=tuple(
             replace(row, nominal=float(value)) for row, value in zip(problem.free, parameters, strict=True)
         ))  # fmt: skip
-        guesses, result, together = self._stage(
-            with_initial_noise(there, self._windows), moved, parameters, guesses, LAST_STEPS
-        )
-        cost = float(np.sqrt(result.chi_square / max(len(result.residuals), 1)))
+        there = with_initial_noise(there, self._windows)
+        guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), LAST_STEPS)
+        cost = _cost(result)
+        self._last = _Stage(there, moved, parameters, guesses), cost
         values = {name: float(guesses[0][ats[0]]) for name, ats in moved.items()}
         sd, weakest = _deviations(result, together, values, cost)
         restored = [self._whole(guess, problem) for guess in guesses]
         return values, sd, weakest, cost, restored
 
-    def _stage(
-        self,
-        problem: Problem,
-        shared: Mapping[str, Sequence[int]],
-        parameters: Array,
-        guesses: Sequence[Array],
-        steps: int,
-    ) -> tuple[list[Array], FitResult, _Together]:
-        """Fit all windows at the noise of ``problem``; the predictor is made around ``guesses``."""
-        objectives, free = [], len(parameters)
+    def _fit(self, stage: _Stage, steps: int, largest: float = 0.0) -> tuple[list[Array], FitResult, _Together]:
+        """Fit all windows; the predictor is made around the guesses.
+
+        Delays of the signals up to the ``largest`` (s) are fitted as well.
+        """
+        objectives, free = [], len(stage.parameters)
         for number, window in enumerate(self._windows):
-            before = guesses[number] if guesses else None
-            start = parameters if before is None else before[:free]
-            objectives.append(Objective(problem, window, start, None if before is None else before[free:]))
-        together = _Together(objectives, shared, problem)
-        begin = list(guesses) or [objective.guess(parameters) for objective in objectives]
+            before = stage.guesses[number] if stage.guesses else None
+            start = stage.parameters if before is None else before[:free]
+            objectives.append(Objective(stage.problem, window, start, None if before is None else before[free:]))
+        together = _Together(objectives, stage.shared, stage.problem, largest)
+        begin = list(stage.guesses) or [objective.guess(stage.parameters) for objective in objectives]
         result = gauss_newton(together, together.joined(begin), steps)
         return together.split(result.guess), result, together
 
@@ -307,6 +375,10 @@ class _ValueSearch:
             else:
                 rows.append(OwnValue(name, values[name], sd[name]))
         return tuple(rows)
+
+
+def _cost(result: FitResult) -> float:
+    return float(np.sqrt(result.chi_square / max(len(result.residuals), 1)))
 
 
 def _are_alike(one: Parameter, other: Parameter) -> bool:
