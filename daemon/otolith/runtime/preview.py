@@ -337,7 +337,7 @@ def _with_window(machine: LoadedMachine, length: float, period: float) -> Loaded
 def _computing_seconds(machine: LoadedMachine, windows: Sequence[Window]) -> list[float]:
     """Return the computing times of some windows that are estimated from, s.
 
-    The first is left out if there are others: its estimate begins with a search of the bounds by a swarm.
+    The first is left out if there are others: its estimate begins with a search of all of the bounds.
     """
     identity = machine.file.machine
     state = initial_state(identity.name, identity.site, machine.problem)

@@ -210,7 +210,7 @@ def _columns(
 def columns_called(name: str, line: str) -> int:
     """How many columns have the ``name``, if ``line`` is the header."""
     rows = (split_quoted(line, sign) for sign in SEPARATORS)
-    return max([_name_and_unit(cell)[0] for cell in row].count(name) for row in rows)
+    return max(sum(name in (cell, _name_and_unit(cell)[0]) for cell in row) for row in rows)
 
 
 def _question(header: Header, cells: list[str], rows: list[list[str]]) -> str:

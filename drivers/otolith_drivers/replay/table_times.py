@@ -22,6 +22,7 @@ from otolith_drivers.units import factor
 
 DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
 DATE_NAME = re.compile(r"datum|date", re.IGNORECASE)
+TIME_IN_DATE = re.compile(r"\d:\d\d")
 TIME_OF_DAY = re.compile(r"\s*\d{1,2}:\d\d")
 # Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
 SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
@@ -91,8 +92,10 @@ def question_of_unit(times: Array) -> str:
 
 def contradiction(name: str, times: Sequence[float], other: str, cells: Sequence[str]) -> str:
     """Return what is asked where ``cells`` of column ``other`` are dates that contradict ``times``, s; else empty."""
+    if not all(map(TIME_IN_DATE.search, cells)):  # a day, or a number of a batch
+        return ""
     dates = [date_of(cell, UTC) for cell in cells]
-    if len(dates) < 2 or not all(map(math.isfinite, (*dates, *times))):
+    if len(set(dates)) < 2 or not all(map(math.isfinite, (*dates, *times))):
         return ""
     by_date, by_time = dates[-1] - dates[0], times[-1] - times[0]
     if abs(by_date - by_time) <= ROUNDED + ALIKE * max(abs(by_date), abs(by_time)):

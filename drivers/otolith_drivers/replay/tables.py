@@ -9,7 +9,6 @@ without its line, lets an open quote swallow the lines below, and knows neither 
 
 import codecs
 import io
-import itertools
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,6 +41,7 @@ from otolith_drivers.replay.readers import (
 )
 from otolith_drivers.replay.table_header import (
     BLANK,
+    MAX_LINE,
     MAX_PREAMBLE,
     NUMBER,
     SECONDS,
@@ -138,9 +138,11 @@ def open_log(path: Path, setup: Setup, _: object = None) -> Reader:
         return TableReader(path, units, sources, ordinary, zone_named(setup.timezone))
 
     by_time = defaultdict[str, list[str]](list)
+    clocks = {signal.source.time.column for signal in signals.values() if signal.source.time is not None}
+    repeated = {column for column in clocks if _are_several(path, column)}
     for name, signal in signals.items():
         time = signal.source.time
-        is_own = time is not None and _are_several(path, time.column)
+        is_own = time is not None and time.column in repeated
         by_time[f"times of {name}" if is_own else f"{time}"].append(name)
     if len(by_time) < 2:
         return open_columns(list(signals))
@@ -152,7 +154,7 @@ def _are_several(path: Path, name: str) -> bool:
     data = DataFile(path)
     try:
         text = decoded(path, data)
-        lines = list(itertools.islice(text, MAX_PREAMBLE))
+        lines = [text.readline(MAX_LINE) for _ in range(MAX_PREAMBLE)]
     finally:
         data.close()
     return any(columns_called(name, line) > 1 for line in lines)

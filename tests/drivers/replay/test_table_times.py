@@ -88,6 +88,27 @@ def test_dates_that_contradict_the_times_are_asked_about(tmp_path: Path) -> None
     assert found["x"] == [(BEGIN + row, float(row)) for row in range(6)]
 
 
+@pytest.mark.parametrize("beside", ["2026-01-31", "20260131", "calibrated 2025-01-31 12:00:00", "2025-01-31 12:00:00"])
+def test_a_constant_date_beside_the_times_contradicts_nothing(tmp_path: Path, beside: str) -> None:
+    path = table(tmp_path, "t,Note,x", [f"{row},{beside},{row}" for row in range(10)])
+    assert len(samples(path, x={})["x"]) == 10
+
+
+def test_the_time_of_a_signal_may_be_named_with_its_unit(tmp_path: Path) -> None:
+    rows = [f"{row},{row},{2 * row},{row}" for row in range(10)]
+    path = table(tmp_path, "Time (s),x,Time (s),y", rows)
+    for name in ("Time (s)", "Time"):
+        found = samples(path, x={"time": name}, y={"time": name})
+        assert_readings(found["y"][9:], [18.0], [9.0])
+
+
+def test_a_line_without_end_is_refused_where_columns_repeat(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("t,x," * 100_000, encoding="utf-8")
+    with raises_saying(ConfigurationError, "table.csv", "100000"):
+        samples(path, x={"time": "t"})
+
+
 @pytest.mark.parametrize(
     ("unit", "step", "begin", "meaning"),
     [
