@@ -16,8 +16,10 @@ from otolith.machine import find_twin, load_rules
 from otolith.storage.history import describe_machine, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.outside_text import CONTROL
 from tests.cli.commands import otolith
 from tests.health.test_events import PLAN
+from tests.hostile import HOSTILE
 from tests.messages import assert_says, raises_saying
 from tests.storage.histories import MACHINE, SITE, document, event
 
@@ -73,18 +75,33 @@ def test_the_command_explains_and_lists() -> None:
         otolith("explain", "unbalence")
 
 
-def test_rules_of_a_machine_file_are_explained_in_terminal_and_page() -> None:
+def monitored(own: Rule) -> None:
+    """Write a history of a machine whose file has a rule, and with one event of it."""
     end = 1_700_000_000.0
-    plan = replace(PLAN, rules=(OWN, *PLAN.rules))
+    plan = replace(PLAN, rules=(own, *PLAN.rules))
     writer = HistoryWriter(history_path(SITE, MACHINE), Bounds(20_000_000, 3650, 24))
     numbers, _ = writer.open(end)
-    raised = event(50, end, EventChange.RAISED).model_copy(update={"condition_id": OWN.id})
+    raised = event(50, end, EventChange.RAISED).model_copy(update={"condition_id": own.id})
     writer.description = describe_machine(find_twin("dc_motor"), plan)
     writer.add(numbers.number(document(50, end).model_copy(update={"events": (raised,)})))
     writer._write_waiting()
     writer._close()
+
+
+def test_rules_of_a_machine_file_are_explained_in_terminal_and_page() -> None:
+    monitored(OWN)
     assert_says(otolith("explain", OWN.id).output, "particles in the oil", "replace the seal kit", "next opportunity")
     page = CliRunner().invoke(cli, ["report", MACHINE, "--since", "9000d", "--output", "-"]).output
     assert_says(page, "particles in the oil", 'href="#condition-0"', 'id="condition-0"')
     assert "<b>worn" not in page
     assert "worn-seal <b>" not in page
+
+
+def test_a_rule_of_any_history_controls_no_terminal_and_makes_no_line() -> None:
+    attacks = " ".join(text for text in HOSTILE if len(text) < 100)
+    monitored(OWN.model_copy(update=dict.fromkeys(("condition", "cause", "advice"), attacks)))
+    markdown_page = ("explain", "--machine", MACHINE, "--markdown")
+    written = otolith(*markdown_page).stdout
+    monitored(OWN)
+    assert written.count("\n") == otolith(*markdown_page).stdout.count("\n")
+    assert not CONTROL.search(written.replace("\n", ""))

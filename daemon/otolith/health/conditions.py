@@ -69,10 +69,15 @@ def markdown(pages: Iterable[ConditionPage], texts: Texts) -> str:
     own = texts.conditions
     lines = [f"# {own['title']}", "", own["about"], ""]
     for page in pages:
-        lines += [f"## {page.id}", "", f"**{page.condition}**", "", "| | |", "|---|---|"]
-        lines += [f"| {own[key]} | {text.replace('|', chr(92) + '|')} |" for key, text in page.texts.items()]
+        lines += [f"## {_line(page.id)}", "", f"**{_line(page.condition)}**", "", "| | |", "|---|---|"]
+        lines += [f"| {own[key]} | {_line(text).replace('|', chr(92) + '|')} |" for key, text in page.texts.items()]
         lines.append("")
     return "\n".join(lines)
+
+
+def _line(text: str) -> str:
+    """Return a text of a rule, which may have several lines in a machine file, as one."""
+    return " ".join(text.splitlines())
 
 
 def _key(kind: FindingKind) -> str:

@@ -60,7 +60,7 @@ def explain(
             raise ConfigurationError(f"no condition {name!r}: {nearest(name, known)}")
     pages = pages_of(conditions or known, rules, texts)
     if as_markdown:
-        click.echo(markdown([condition_page(rule, rules, texts) for rule in rules], texts), nl=False)
+        echo(*markdown([condition_page(rule, rules, texts) for rule in rules], texts).splitlines())
     elif as_json:
         echo_json({"conditions": [{"id": page.id, "condition": page.condition, **page.texts} for page in pages]})
     elif not conditions:
