@@ -233,3 +233,13 @@ def test_times_of_notes_are_labels(worn: Run) -> None:
     assert [note.at for note in event.comments or ()] == [worn.event.shelved.at + 1e9]
     assert health is not None
     assert health.shelved == event.shelved.until
+
+
+@pytest.mark.parametrize("words", ["since 2026-01-31 12:00:00 UTC", 'a 3" pipe, since 2026-01-31 12:00:00 UTC'])
+def test_the_words_of_a_person_keep_their_times(worn: Run, words: str) -> None:
+    worn.note(Deed.COMMENT, words)
+    worn.windows(1, WORN)
+    own = "R_a 5 Ω since 2026-01-30 12:00:00 UTC"
+    text = event_text(worn.event.model_copy(update={"timezone": "Europe/Berlin", "text": own}))
+    assert "2026-01-31 12:00:00 UTC" in text
+    assert "2026-01-30 13:00:00 CET" in text

@@ -14,7 +14,15 @@ from benchmarks.browser import Browser, browser, program
 from benchmarks import pictures
 from otolith.health.labels import TimeLabels
 from otolith.health.limits import Level
-from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
+from otolith.health.schema import (
+    CountersDocument,
+    EventChange,
+    HealthDocument,
+    NoteDocument,
+    PartDocument,
+    ReportDocument,
+    Status,
+)
 from otolith.health.text import texts_in
 from otolith.publishing.html_report import MAX_ROWS, Axis, html_report
 from otolith.storage.history import DAY, HOUR, WINDOW, HistoryReader, history_path
@@ -358,3 +366,14 @@ def test_a_printed_page_has_few_sheets_of_paper(simulated: dict[str, str], tab: 
     assert sheets.startswith(b"%PDF")
     assert 1 <= len(re.findall(rb"/Type\s*/Page\b", sheets)) <= 3
     assert re.search(rb"/MediaBox\s*\[\s*0 0 59[45]\.?\d* 84[12]", sheets)  # A4
+
+
+def test_times_of_ours_are_those_of_the_plant_and_words_of_a_person_stay() -> None:
+    note = NoteDocument(at=START, by="anna", text="since 2026-01-31 12:00:00 UTC")
+    update = {"comments": (note,), "timezone": "Europe/Berlin", "text": "R_a since 2026-01-30 12:00:00 UTC"}
+    raised = document(0, START + 2.0, change=EventChange.RAISED).events[0].model_copy(update=update)
+    health = state_of(Level.OK, START).model_copy(update={"timezone": "Europe/Berlin"})
+    own = [report.model_copy(update={"events": (raised,)}) for report in reports(1, health=health)]
+    text = page(written(own), now=START + 2.0).text
+    assert "2026-01-31 12:00:00 UTC" in text
+    assert "2026-01-30 13:00:00 CET" in text

@@ -161,8 +161,11 @@ def event_text(event: EventDocument, when: Clock | None = None, *, details: bool
     With ``details`` also what to write into the machine file, as the specialist reads it, and the command that explains
     the condition.
     """
-    sentence = _event_sentence(event, when or clock_in(event.timezone), details=details)
-    return texts_in(event.language).decimals(in_local_time(sentence, event.timezone))
+    # Before the sentence is made: it also has the words of persons, whose times stay as they wrote them.
+    own = {"text": event.text, "reason": event.reason}
+    update = {key: in_local_time(text, event.timezone) for key, text in own.items() if text}
+    sentence = _event_sentence(event.model_copy(update=update), when or clock_in(event.timezone), details=details)
+    return texts_in(event.language).decimals(sentence)
 
 
 def _event_sentence(event: EventDocument, when: Clock, *, details: bool) -> str:

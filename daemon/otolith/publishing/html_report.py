@@ -165,8 +165,9 @@ def html_report(
     is_dated = is_of_calendar(axis.begin)
     own_when = (lambda seconds: f"{local_moment(seconds, axis.zone):%F %T}") if is_dated else clock_in(axis.zone)
     own = {"when": own_when, "part": say.part}
-    own["words"] = lambda written: in_local_time(say.translated(written), axis.zone)
-    own["whole"] = lambda written: whole(in_local_time(say.decimals(written), axis.zone))
+    own["words"] = say.translated
+    own["note"] = lambda written: whole(say.decimals(written))  # in the words of a person, whose times stay
+    own["whole"] = lambda written: own["note"](in_local_time(written, axis.zone))
     environment.filters |= vars(text) | {"quantity_text": quantity_text} | own
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = f"{local_moment(now, axis.zone):%Z}" if is_dated else ""
