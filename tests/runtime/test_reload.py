@@ -75,13 +75,16 @@ def test_all_else_needs_a_restart(tmp_path: Path, before: str, after: str, keys:
     assert f"only a restart takes over {', '.join(keys)}" in result.text
 
 
-def test_limits_wait_for_a_restart_with_the_language_of_their_texts(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("key", "value"), [("language", "de"), ("timezone", "Europe/Berlin")])
+def test_limits_wait_for_a_restart_with_the_language_or_the_zone_of_their_texts(
+    tmp_path: Path, key: str, value: str
+) -> None:
     (tmp_path / "machine.toml").write_text(TEXT, encoding="utf-8")
     running = load_machine(tmp_path / "machine.toml", with_driver=False)
-    text = TEXT.replace('"+40 %"', '"+60 %"').replace('name = "motor"', 'name = "motor"\nlanguage = "de"')
+    text = TEXT.replace('"+40 %"', '"+60 %"').replace('name = "motor"', f'name = "motor"\n{key} = "{value}"')
     (tmp_path / "machine.toml").write_text(text, encoding="utf-8")
     result = reloaded(running, load_machine(tmp_path / "machine.toml", with_driver=False))
-    assert result.needs_restart == ("machine.language", "parameters.R_a.act")
+    assert result.needs_restart == (f"machine.{key}", "parameters.R_a.act")
     assert result.machine.plan == running.plan
 
 

@@ -73,6 +73,7 @@ OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a netw
 MAX_STATUS = 1000  # characters of a line for systemd, beyond which it is cut: a datagram that is too long is not sent
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
+_WORDING: set[Key] = {("machine", "language"), ("machine", "timezone")}  # what texts of limits and rules depend on
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +99,7 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     """Return ``running`` with what it can take over from ``new``.
 
     Limits may be percentages of values, so they are taken over only with the parameters they belong to. With them come
-    the texts of the rules, so they also wait for a restart if the language has changed.
+    the texts of the rules and the zone of their times, so they also wait for a restart if one of these has changed.
     """
     old, file = running.file, new.file
     changed = list(_differences(old.model_dump(), file.model_dump()))
@@ -111,7 +112,7 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     own = file.zenoh.access.model_copy(update={"networks": old.zenoh.access.networks})
     tables = {"tls": file.zenoh.tls, "access": own}
     update: dict[str, Any] = {"recording": file.recording, "zenoh": old.zenoh.model_copy(update=tables)}
-    if any(key[0] in {"twin", "parameters"} or key == ("machine", "language") for key in rest):
+    if any(key[0] in {"twin", "parameters"} or key in _WORDING for key in rest):
         rest, limits = [*rest, *limits], []
     if limits:
         update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
