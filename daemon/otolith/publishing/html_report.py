@@ -167,7 +167,7 @@ def html_report(
     own = {"when": own_when, "part": say.part}
     own["words"] = say.translated
     own["note"] = lambda written: whole(say.decimals(written))  # in the words of a person, whose times stay
-    own["whole"] = lambda written: own["note"](in_local_time(written, axis.zone))
+    own["whole"] = lambda written: whole(say.decimals(in_local_time(written, axis.zone)))
     environment.filters |= vars(text) | {"quantity_text": quantity_text} | own
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     zone = f"{local_moment(now, axis.zone):%Z}" if is_dated else ""
