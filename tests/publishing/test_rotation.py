@@ -191,3 +191,42 @@ def test_a_certificate_that_expires_soon_is_an_event_in_the_history_and_no_state
     assert last.health is not None
     assert last.health.state is Level.OK
     assert any("press.crt" in note for note in last.notes)
+
+
+@pytest.mark.parametrize("error", [ConfigurationError("press.key: does not belong"), RuntimeError("a bug")])
+def test_what_cannot_be_opened_anew_is_named_and_tried_again_and_the_rest_goes_on(
+    site: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """The files may change again between the look at them and the new session."""
+    good, bad = (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
+    daemon = stack.enter_context(closing(Publisher("here", "motor", [good, bad], access(site))))
+    opening, failing = daemon._open, [True]
+
+    def opened(endpoints: publisher._Endpoints) -> None:
+        if failing and bad in endpoints.listen:
+            raise error
+        opening(endpoints)
+
+    monkeypatch.setattr(daemon, "_open", opened)
+    assert keys("renew", site, "press").exit_code == 0
+    wait_for(lambda: str(error) in daemon.outages(utc_now()).get(f"reports on {bad}", ""))
+    wait_for(lambda: daemon.endpoints == good)
+    failing.clear()
+    wait_for(lambda: not daemon.outages(utc_now()))
+    assert daemon.endpoints == f"{good}, {bad}"
+
+
+def test_files_that_cannot_be_checked_leave_the_session_and_the_thread(
+    site: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site))))
+
+    def broken(*_: object) -> None:
+        raise ValueError("a form of certificate that is not known")
+
+    monkeypatch.setattr(daemon, "_settings", broken)
+    assert keys("renew", site, "press").exit_code == 0
+    wait_for(lambda: "not known" in caplog.text)
+    assert daemon._thread.is_alive()
+    assert daemon.endpoints == endpoint

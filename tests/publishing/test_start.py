@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from rich.console import Console
 
@@ -82,3 +83,18 @@ def test_the_service_tells_each_step_once() -> None:
         service._show_preparation()
     assert [document.done for document in recorded.starts] == [0, 1, 2, 11]
     assert ["1 of 11" in status for status in recorded.statuses] == [False, True, False, False]
+
+
+def test_no_session_is_closed_while_a_start_is_put_on_it() -> None:
+    publisher, held = Publisher(SITE, MACHINE, []), list[bool]()
+
+    class Session:
+        def put(self, *_: object, **__: object) -> None:
+            held.append(publisher._lock.locked())
+
+    (own,) = publisher._sessions
+    publisher._sessions = (replace(own, opened=Session()),)  # type: ignore[arg-type]  # has the method that is used
+    publisher.publish_start(start(2))
+    publisher._sessions = (own,)
+    publisher.close()
+    assert held == [True]

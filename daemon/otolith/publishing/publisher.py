@@ -38,6 +38,7 @@ FIRST_RETRY, MAX_RETRY = 1.0, 30.0  # s from an endpoint that could not be opene
 RENEWAL_INTERVAL = 60.0  # s between two looks at the files of certificates and passwords
 NOTICE_DAYS = (30, 7)  # days before a certificate expires at which that is an event
 CLOSE_WAIT = 1.0  # s for a try that has begun
+RENEWAL = "its session is opened anew"  # Why endpoints wait whose files were replaced
 UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; everything else is a mistake
 
 
@@ -124,13 +125,8 @@ class Publisher:
             self._latest = text
             for each in self._sessions:
                 each.reports.put(text)
-                for key, own in texts:
-                    each.opened.put(
-                        key,
-                        own,
-                        encoding=zenoh.Encoding.APPLICATION_JSON,
-                        congestion_control=zenoh.CongestionControl.DROP,
-                    )
+            for key, own in texts:
+                self._put(key, own)
 
     def reload(self, access: Access) -> None:
         """Let a thread take over certificates, passwords and readers of a changed machine file."""
@@ -141,15 +137,8 @@ class Publisher:
         """Tell how far the daemon is that starts; a document that is done is the last one."""
         text = document.json_line()
         with self._lock:
-            self._start, sessions = text if document.done < document.total else None, self._sessions
-        for each in sessions:
-            key = START.under(self._site, self._machine)
-            each.opened.put(
-                key,
-                text,
-                encoding=zenoh.Encoding.APPLICATION_JSON,
-                congestion_control=zenoh.CongestionControl.DROP,
-            )
+            self._start = text if document.done < document.total else None
+            self._put(START.under(self._site, self._machine), text)
 
     def outages(self, now: datetime) -> dict[str, str]:
         """Return the endpoints where nobody can connect, and why."""
@@ -191,6 +180,16 @@ class Publisher:
         for each in sessions:
             close_session(each.opened)
 
+    def _put(self, key: str, text: str) -> None:
+        """Put a document on each session; the caller has the lock, so that no session is closed meanwhile."""
+        for each in self._sessions:
+            each.opened.put(
+                key,
+                text,
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+
     def _open_each(self, everything: _Endpoints, error: OtolithError) -> None:
         """Open what can be opened after all endpoints together gave the ``error``."""
         single = list(everything.single)
@@ -213,48 +212,56 @@ class Publisher:
             if self._closing.is_set():
                 return
             pause = min(2.0 * pause, MAX_RETRY) if self._waiting else FIRST_RETRY
-            self._retry()
             self._renew()
+            self._retry()
 
     def _renew(self) -> None:
-        """Open each session anew whose files were replaced, or whose access was changed, if they can be used now."""
+        """Close each session whose files were replaced, or whose access was changed, if they can be used now.
+
+        Its endpoints wait from then on, and are opened like all that wait.
+        """
         with self._lock:
             sessions, access = self._sessions, self._access
         for each in sessions:
-            if each.access == access and each.stamps == access.stamps():
-                continue
             try:
+                if each.access == access and each.stamps == access.stamps():
+                    continue
                 self._settings(access, each.endpoints)
-            except (OtolithError, OSError) as error:  # one of two files may not be written yet
-                if str(error) != self._refused:
-                    self._refused = str(error)
-                    log.warning("%s: not taken over: %s", each.endpoints.text, error)
+            except Exception as error:  # noqa: BLE001 - one of two files may not be written yet; no bug ends the thread
+                if (reason := str(error) or type(error).__name__) != self._refused:
+                    self._refused = reason
+                    log.warning("%s: not taken over: %s", each.endpoints.text, reason)
                 continue
             self._refused = ""
             with self._lock:
                 self._sessions = tuple(other for other in self._sessions if other is not each)
-            close_session(each.opened)
+                self._waiting = {**self._waiting, each.endpoints: RENEWAL}
             try:
-                self._open(each.endpoints)
-            except UNAVAILABLE as error:
-                self._open_each(each.endpoints, error)
-            end = "" if self._validity.end is None else f", which are valid until {self._validity.end:%Y-%m-%d}"
-            log.info("reports on %s: certificates, passwords and readers are taken over%s", each.endpoints.text, end)
+                close_session(each.opened)
+            except Exception as error:  # noqa: BLE001 - as above
+                log.warning("%s: the session before was not closed: %s", each.endpoints.text, error)
 
     def _retry(self) -> None:
-        for endpoints, before in list(self._waiting.items()):
-            reason = ""
+        """Open the endpoints that wait; of several that cannot be opened together, each gets a session of its own."""
+        due = dict(self._waiting)
+        while due:
+            endpoints, before = due.popitem()
+            reason, parts = "", [endpoints]
             try:
                 self._open(endpoints)
             except Exception as error:  # noqa: BLE001 - OtolithError, OSError of a disk, or a bug: none ends it
-                reason = str(error) or type(error).__name__
-            if not reason:
-                log.info("reports on %s as well", endpoints.text)
-            elif reason != before:
+                reason, parts = str(error) or type(error).__name__, list(endpoints.single) or parts
+            if len(parts) > 1:
+                due |= dict.fromkeys(parts, "")
+            elif reason and reason != before:
                 log.warning("no reports on %s: %s; it is tried again", endpoints.text, reason)
-            waiting = {**self._waiting, endpoints: reason}
+            elif not reason:
+                end = "" if self._validity.end is None else f", which are valid until {self._validity.end:%Y-%m-%d}"
+                renewed = f": certificates, passwords and readers are taken over{end}"
+                log.info("reports on %s%s", endpoints.text, renewed if before == RENEWAL else " as well")
             with self._lock:
-                self._waiting = {each: text for each, text in waiting.items() if text}
+                rest = {each: text for each, text in self._waiting.items() if each != endpoints}
+                self._waiting = rest | dict.fromkeys(parts if reason else (), reason)
 
     def _open(self, endpoints: _Endpoints) -> None:
         """Open a session; raise what is in ``UNAVAILABLE``, or ConfigurationError."""
