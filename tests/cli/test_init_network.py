@@ -9,10 +9,14 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 from asyncua import Client
 
-from otolith.machine import load_machine
+from otolith.cli.commissioning.draft.answers import Answers
+from otolith.cli.commissioning.draft.displays import with_displays
+from otolith.cli.commissioning.draft.offers import Offer
+from otolith.machine import find_twin, load_machine
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
 from otolith_drivers.mqtt_probe import ObservedMessages
@@ -83,6 +87,16 @@ def test_values_off_the_display_say_which_register_is_what(tmp_path: Path) -> No
     assert signals["V_a"] == {"register": 10, "type": "int16", "unit": "V", "scale": 0.1}
     assert signals["i"] == {"register": 11, "type": "int16", "unit": "A", "scale": 0.001}
     assert signals["omega"] == {"register": 12, "type": "int16", "unit": "rpm", "scale": 1.0}
+
+
+@pytest.mark.parametrize("held", [{"10": 241.0, "11": 2310.0}, {}], ids=len)
+def test_a_displayed_value_without_a_register_is_named(held: dict[str, float]) -> None:
+    shown = Answers(displays={"V_a": "24.1 V", "i": "2.31 A", "omega": "1450 rpm"})
+    offers = [Offer(name, None, {}, np.full(3, value)) for name, value in held.items()]
+    registers = [f"{name}: {value:g}" for name, value in held.items()]
+    lost = ["omega=1450 rpm", *([] if held else ["V_a=24.1 V", "i=2.31 A"])]
+    with raises_saying(ConfigurationError, *lost, *registers, "--registers"):
+        with_displays(shown, offers, [find_twin("dc_motor")])
 
 
 def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,14 +38,13 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
     names = [name for name in shown if name not in answers.signals]
     distances = np.array([[_distance(shown[name][0], offer) for offer in offers] for name in names])
     signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
-    for at, place in zip(*linear_sum_assignment(distances.reshape(len(names), len(offers))), strict=True):
+    pairs = list(zip(*linear_sum_assignment(distances.reshape(len(names), len(offers))), strict=True))
+    found = {names[at] for at, place in pairs if distances[at, place] <= CLOSE}
+    if lost := [f"{name}={answers.displays[name]}" for name in names if name not in found]:
+        raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(offers)}")
+    for at, place in pairs:
         name, offer = names[at], offers[int(place)]
         value, unit = shown[name]
-        if distances[at, place] > CLOSE:
-            held = ", ".join(f"{row.name}: {float(np.median(row.values)):.5g}" for row in offers)
-            fault = f"--display {name}: no register holds {value:g} times a power of ten ({held})"
-            remedy = "let the machine run steadily and read the display again, or choose others by --registers"
-            raise ConfigurationError(f"{fault}: {remedy}")
         power = _power(value, offer)
         signals[name], units[offer.name] = offer.name, units.get(offer.name, unit)
         scales.setdefault(offer.name, f"{10.0**power:g}")
@@ -55,6 +54,13 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
             remedy = f"another speed or load decides, or --signal {name}=REGISTER"
             echo(f"! {', '.join(others)} would fit {name} as well: {remedy}")
     return replace(answers, twin=twin.name, signals=signals, units=units, scales=scales)
+
+
+def _not_found(offers: Sequence[Offer]) -> str:
+    """Return why no register can have a displayed value, and what to do."""
+    held = ", ".join(f"{row.name}: {float(np.median(row.values)):.5g}" for row in offers if len(row.values)) or "none"
+    fault = f"no register of its own holds it times a power of ten (those that change: {held})"
+    return f"{fault}: let the machine run steadily and read the display again, or choose others by --registers"
 
 
 def _twin_of(answers: Answers, twins: Sequence[Definition]) -> Definition:
