@@ -93,11 +93,14 @@ def reason_of(error: Exception) -> str:
     return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
 
 
-def replace_file(path: Path, data: bytes, temporary: str) -> None:
+def replace_file(
+    path: Path, data: bytes, temporary: str, mode: int = 0o600, owner: os.stat_result | None = None
+) -> None:
     """Replace a file, all or nothing, also if the computer loses power meanwhile; raise ServiceError if that fails.
 
     ``temporary`` is a name beside it. All names are relative to the open folder: its owner could replace a path while
-    root writes there.
+    root writes there. The file gets the user and the group of ``owner``; without one, those of the folder if root
+    writes.
     """
     try:
         with opened_folder(path.parent) as folder:
@@ -113,11 +116,15 @@ def replace_file(path: Path, data: bytes, temporary: str) -> None:
                 with os.fdopen(handle, "wb") as stream:
                     stream.write(data)
                     stream.flush()
-                    give_to(os.fstat(folder), handle)
+                    if owner is None:
+                        give_to(os.fstat(folder), handle)
+                    else:
+                        _keep_owner(path, owner, handle)
+                    os.fchmod(handle, mode)
                     os.fsync(handle)
                 os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
                 os.fsync(folder)
-            except OSError:
+            except (OSError, ServiceError):
                 with contextlib.suppress(OSError):
                     os.unlink(temporary, dir_fd=folder)
                 raise
@@ -136,6 +143,19 @@ def opened_folder(folder: Path) -> Iterator[int]:
         yield handle
     finally:
         os.close(handle)
+
+
+def _keep_owner(path: Path, owner: os.stat_result, handle: int) -> None:
+    """Give the open successor of ``path`` to its owner; raise ServiceError if this user may not."""
+    status = os.fstat(handle)
+    if (status.st_uid, status.st_gid) == (owner.st_uid, owner.st_gid):
+        return
+    try:
+        os.fchown(handle, owner.st_uid, owner.st_gid)
+    except PermissionError as error:
+        remedy = "repeat the command as that user or as root"
+        fault = f"it belongs to user {owner.st_uid} and group {owner.st_gid}, which this user cannot give to a file"
+        raise ServiceError(f"{path}: not written: {fault}: {remedy}") from error
 
 
 def give_to(owner: os.stat_result, handle: int) -> None:

@@ -11,7 +11,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,6 +200,8 @@ def _machines_with(path: Path, folder: Path) -> Iterator[Path]:
 
 def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     """Write a file as a whole; what it replaces is kept with a ``~``. Return whether it replaces another content."""
+    from otolith.storage.disk import replace_file
+
     path = root / item.path
     before = path.read_bytes() if path.is_file() else None
     if before == item.content:
@@ -219,11 +220,8 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
         os.umask(umask)
     if before is not None:
         shutil.copy2(path, path.with_name(f"{path.name}~"))
-    handle, temporary = tempfile.mkstemp(dir=path.parent)
-    with os.fdopen(handle, "wb") as stream:
-        stream.write(item.content)
-        os.fchmod(stream.fileno(), 0o640 if item.is_private else 0o644)
-    Path(temporary).replace(path)
+    target, mode = path.parent.resolve() / path.name, 0o640 if item.is_private else 0o644
+    replace_file(target, item.content, f".{path.name}.new", mode)
     return before is not None
 
 
