@@ -9,13 +9,18 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.adaptation.state import apply_decisions, initial_state
+from otolith.cli.commissioning import noise
+from otolith.cli.commissioning.noise import UnusableData
 from otolith.cli.main import cli
+from otolith.commissioning import own_values
+from otolith.commissioning.own_values import OwnValue, OwnValues
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded, replay_recorder
 from otolith.storage.history import describe_machine, history_directory
 from otolith.storage.log_history import log_history
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.grammars.toml_lines import toml_value
 from otolith_drivers.plant.dc_motor import MotorScenario, SetPoint
 from otolith_drivers.plant.scenario import simulate
 from tests.cli.commands import otolith, tables
@@ -27,6 +32,9 @@ from tests.messages import assert_says, raises_saying
 BEGIN = 1_800_000_000.0  # Unix s
 WINDOWS, RECORDS, PERIOD = 25, 200, 0.01
 OWN = {"R_a": 2.1, "L_a": 0.12, "J": 4e-4, "K_e": 0.11, "K_t": 0.11, "D": 6e-4}
+
+
+SPAN = ["--since", "2027-01-15T08:00:00+00:00", "--until", "2027-01-15T08:01:00+00:00"]
 
 
 @pytest.fixture
@@ -112,11 +120,57 @@ def test_a_running_machine_gets_a_baseline_and_keeps_what_it_has_learned(ran: Pa
 
 
 def test_a_running_machine_gets_noise_into_its_file(ran: Path) -> None:
-    span = ["--since", "2027-01-15T08:00:00+00:00", "--until", "2027-01-15T08:01:00+00:00"]
-    result = otolith("commission", ran, *span, "--windows", "4", "--write")
+    result = otolith("commission", ran, *SPAN, "--windows", "4", "--write")
     assert_says(result.stderr, str(ran), "[noise]", "[process_noise]")
     assert float(str(tables(ran)["noise"]["i"]).split()[0]) == pytest.approx(0.005, rel=0.2)
     load_machine(ran, with_driver=False)
+
+
+LIMITS = {"watch": ["-10 %", "+10 %"], "act": ["-20 %", "+20 %"], "low": "4 ohm"}
+
+
+def with_limits(file: Path) -> str:
+    """Give a person's limits in place of the value of R_a."""
+    text = file.read_text(encoding="utf-8")
+    text = text.replace('{ value = "6.5 ohm", estimate = true }', toml_value(LIMITS))
+    file.write_text(text, encoding="utf-8")
+    return text
+
+
+def found(monkeypatch: pytest.MonkeyPatch, value: float, cost: float = 1.0) -> None:
+    """Let the data show ``value`` for R_a."""
+    values = OwnValues((OwnValue("R_a", value, 0.01),), {}, cost, 4)
+    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+
+
+def test_values_that_are_written_leave_the_limits_of_a_person(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(*_: object) -> None:
+        raise UnusableData("no window can be used")
+
+    with_limits(ran)
+    found(monkeypatch, 6.6)
+    monkeypatch.setattr(noise, "identified_record", nothing)
+    result = otolith("commission", ran, *SPAN, "--windows", "4", "--write")
+    stated = {"value": "6.6 ohm", "estimate": True, "high": "26.4 ohm"} | LIMITS
+    assert tables(ran)["parameters"]["R_a"] == stated
+    assert "values, noise and delays are as they were" not in result.stderr
+    assert_says(result.stderr, "noise and delays are as they were: no window can be used", "started again")
+
+
+@pytest.mark.parametrize(
+    ("value", "cost", "words"),
+    [(3.0, 1.0, ("parameters.R_a", "3 ohm", "4", "low")), (6.6, 1e3, ("dc_motor", "1e+03", "[signals]"))],
+    ids=["outside the bounds of the file", "not described by the twin"],
+)
+def test_values_that_cannot_be_taken_end_it(
+    value: float, cost: float, words: tuple[str, ...], ran: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = with_limits(ran)
+    found(monkeypatch, value, cost)
+    with raises_saying(ConfigurationError, *words):
+        otolith("commission", ran, *SPAN, "--windows", "4", "--write")
+    assert ran.read_text(encoding="utf-8") == text
+    assert store_of(load_machine(ran, with_driver=False)).decisions().baselines == {}
 
 
 def test_a_time_without_estimates_gives_no_baseline(ran: Path) -> None:

@@ -1,14 +1,16 @@
 """Changes of single keys of a machine file leave all its other lines as they are."""
 
+import os
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from otolith.cli.commissioning.machine_lines import NewLine, Unchangeable, with_delay, with_keys, write_machine_file
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.hostile import HOSTILE
+from tests.messages import raises_saying
 
 TEXT = """# a comment, which stays
 [signals]
@@ -50,6 +52,39 @@ def test_a_delay_enters_the_signal_however_it_is_written(name: str) -> None:
     assert after == before
 
 
+LIMITS = {"watch": ["-10 %", "+10 %"], "low": "1 ohm", "temperature": "T_w"}
+FOUND = {"value": "2.1 ohm", "estimate": True, "low": "0.5 ohm", "high": "8.4 ohm"}
+INLINE = '{ watch = ["-10 %", "+10 %"], low = "1 ohm", temperature = "T_w" }'
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        f"[parameters]\nR_a = {INLINE}\nJ = 1\n",
+        f"[parameters]\nR_a = {INLINE}  # of the {{ data sheet }}\n",
+        '[parameters.R_a]\nwatch = [\n  "-10 %",  # kept\n  "+10 %",\n]\nlow = "1 ohm"\ntemperature = "T_w"\n[noise]\n',
+    ],
+    ids=["inline", "with a remark", "with a header"],
+)
+def test_a_table_that_is_there_keeps_what_a_person_has_stated(before: str) -> None:
+    text = with_keys(before, "parameters", {"R_a": NewLine(FOUND, "found")})
+    assert tomllib.loads(text)["parameters"]["R_a"] == FOUND | LIMITS
+    for remark in ("# of the { data sheet }", "# kept"):
+        assert (remark in text) == (remark in before)
+    short = tomllib.loads(with_keys(before, "parameters", {"R_a": NewLine("2.1 ohm")}))
+    assert short["parameters"]["R_a"] == LIMITS | {"value": "2.1 ohm"}
+
+
+def test_a_file_with_the_ends_of_lines_of_windows_keeps_them() -> None:
+    lines = {"R_a": NewLine("2.1 ohm", "new"), "J": NewLine("1 kg*m^2")}
+    text, crlf = TEXT, TEXT.replace("\n", "\r\n")
+    for table in ("parameters", "process_noise"):
+        text, crlf = with_keys(text, table, lines), with_keys(crlf, table, lines)
+    for signal in ("V_a", "i", "omega", "T_load"):
+        text, crlf = with_delay(text, signal, "9.7 ms", "± 1 ms"), with_delay(crlf, signal, "9.7 ms", "± 1 ms")
+    assert crlf == text.replace("\n", "\r\n")
+
+
 def test_a_layout_that_is_not_understood_is_refused() -> None:
     array = '[noise]\ni = [\n  "5 mA",\n]\n'
     with pytest.raises(Unchangeable):
@@ -76,4 +111,43 @@ def test_what_the_daemon_refuses_is_not_written(tmp_path: Path) -> None:
     write_machine_file(file, text + "\n# more\n")
     assert file.read_text(encoding="utf-8").endswith("# more\n")
     assert file.stat().st_mode & 0o777 == 0o640
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_link_its_owner_and_the_ends_of_lines_stay(tmp_path: Path) -> None:
+    target, link = tmp_path / "there" / "machine.toml", tmp_path / "machine.toml"
+    target.parent.mkdir()
+    target.write_bytes(MACHINE.read_bytes().replace(b"\n", b"\r\n"))
+    link.symlink_to(target)
+    owner = (4711, 4712) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
+    os.chown(target, *owner)
+    target.chmod(0o660)
+    text = target.read_bytes().decode() + "# more\r\n"
+    write_machine_file(link, text)
+    status = target.stat()
+    assert link.is_symlink()
+    assert target.read_bytes() == text.encode()
+    assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (*owner, 0o660)
+
+
+@pytest.mark.parametrize("call", ["fsync", "fchown"])
+def test_a_file_that_cannot_be_replaced_as_it_is_stays(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails, or another user owns the file, who would lose it."""
+    file, status = tmp_path / "machine.toml", os.stat_result
+
+    def refused(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    file.write_bytes(MACHINE.read_bytes())
+    monkeypatch.setattr(os, call, refused)
+    if call == "fchown":
+        real = Path.stat
+        monkeypatch.setattr(
+            Path, "stat", lambda path, **given: status([*real(path, **given)[:4], 4711, 4712, *real(path, **given)[6:]])
+        )
+    with raises_saying(ServiceError, str(file), *(["4711", "root"] if call == "fchown" else [])):
+        write_machine_file(file, MACHINE.read_text(encoding="utf-8") + "# more\n")
+    assert file.read_bytes() == MACHINE.read_bytes()
     assert list(tmp_path.iterdir()) == [file]

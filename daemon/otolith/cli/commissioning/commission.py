@@ -157,7 +157,6 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
     from otolith.cli.commissioning.machine_lines import NewLine
     from otolith.estimation.information import QUANTILE
     from otolith.health.text import interval_text
-    from otolith.twin.definition import Role
 
     lines, remarks = dict[str, NewLine](), list[str]()
     for item in found.values:
@@ -172,19 +171,38 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
         else:
             remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, from {data.name}"
             remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({row.meaning})")
-        value: dict[str, object] | str = f"{item.value:.5g} {row.unit}"
-        if row.role is Role.ESTIMATED:
-            low, high = _bounds(row, item.value)
-            value = {"value": value, "estimate": True, "low": f"{low:.4g} {row.unit}", "high": f"{high:.4g} {row.unit}"}
+        value = _written_value(machine, row, item.value, _bounds(row, item.value))
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
         row, largest = machine.twin.parameter(name), max(abs(low), abs(high))
         if largest > LOAD_SHARE * max(abs(row.low), abs(row.high)):
             ends = (0.0 if row.low >= 0.0 else -REACH * largest, 0.0 if row.high <= 0.0 else REACH * largest)
-            bounds = {key: f"{end:.3g} {row.unit}" for key, end in zip(("low", "high"), ends, strict=True)}
-            value = {"value": f"{0.5 * (low + high):.3g} {row.unit}", "estimate": True, **bounds}
-            lines[name] = NewLine(value, row.meaning)
+            lines[name] = NewLine(_written_value(machine, row, 0.5 * (low + high), ends), row.meaning)
     return lines, remarks
+
+
+def _written_value(
+    machine: "LoadedMachine", row: "Parameter", value: float, bounds: tuple[float, float]
+) -> dict[str, object] | str:
+    """Return a found value as the file gets it; raise ConfigurationError if bounds that the file states exclude it.
+
+    ``bounds`` are those of an estimate for which the file states none.
+    """
+    from otolith.machine_file import ParameterTable
+    from otolith.twin.definition import Role
+    from otolith_drivers.errors import ConfigurationError
+    from otolith_drivers.units import Quantity
+
+    stated, unit, text = machine.file.parameters.get(row.name, ParameterTable()), row.unit, f"{value:.5g} {row.unit}"
+    if not (row.role is Role.ESTIMATED if stated.estimate is None else stated.estimate):
+        return text
+    ends = (stated.low, bounds[0]), (stated.high, bounds[1])
+    low, high = (default if written is None else Quantity(unit)(written) for written, default in ends)
+    if not low <= value <= high:
+        fault = f"the data show {value:.4g} {unit}, outside the bounds {low:.4g} to {high:.4g} {unit} of the file"
+        remedy = "nothing is written: correct low and high, or write the value of your machine"
+        raise ConfigurationError(f"{machine.path}: parameters.{row.name}: {fault}: {remedy}")
+    return {"value": text, "estimate": True, "low": f"{low:.4g} {unit}", "high": f"{high:.4g} {unit}"}
 
 
 def _bounds(row: "Parameter", value: float) -> tuple[float, float]:
@@ -231,7 +249,7 @@ def _written(machine: "LoadedMachine", change: Callable[[str], str]) -> "LoadedM
     from otolith_drivers.errors import ConfigurationError
 
     try:
-        text = change(machine.path.read_text(encoding="utf-8"))
+        text = change(machine.path.read_bytes().decode())  # with its ends of lines
     except Unchangeable as error:
         remedy = "change it by hand: without --write the lines are printed"
         raise ConfigurationError(f"{machine.path}: {error}: {remedy}") from error
@@ -382,9 +400,8 @@ def _commission_running(
     write: bool,
 ) -> None:
     """Commission by what a daemon has recorded and estimated from the first time of ``span`` to the second."""
-    from otolith.cli.commissioning.noise import HealthySpan, delay_lines, identified_record, noise_lines
+    from otolith.cli.commissioning.noise import HealthySpan, UnusableData, delay_lines, identified_record, noise_lines
     from otolith.storage.history import HistoryReader, history_path
-    from otolith_drivers.errors import ConfigurationError
 
     names = machine.file.machine
     reader, data = HistoryReader(history_path(names.site, names.name)), HealthySpan(machine, *span)
@@ -395,14 +412,16 @@ def _commission_running(
         if write:
             machine = _with_own_values(machine, data, windows)
         record = identified_record(machine, data, windows)
-    except ConfigurationError as error:  # it records nothing, or not for so long
-        echo(f"values, noise and delays are as they were: {error}", err=True)
+    except UnusableData as error:  # it records nothing, or not for so long
+        what = "values, noise and delays" if machine is before else "the new values are in the file; noise and delays"
+        echo(f"{what} are as they were: {error}", err=True)
     else:
         if write:
             machine = _with_noise_and_delays(machine, record.noise, record.delays)
-            echo("a running daemon takes these lines over when it is started again", err=True)
         else:
             echo(*noise_lines(machine, record.noise), *delay_lines(machine, record.delays))
+    if machine is not before:
+        echo("a running daemon takes these lines over when it is started again", err=True)
     known = store.decisions()
     records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
     approved, rejected = asked(machine, records, decide=decide)

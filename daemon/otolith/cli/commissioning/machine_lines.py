@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from otolith.machine import load_machine
+from otolith.storage.disk import replace_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 
@@ -36,7 +37,8 @@ class Unchangeable(ValueError):  # noqa: N818 - it is told as part of another er
 def with_keys(text: str, table: str, lines: Mapping[str, NewLine]) -> str:
     """Return the file with keys of a table, which is added at the end if it is missing.
 
-    A key replaces its line, or the one with ``#`` that has its default. Raises Unchangeable.
+    A key replaces its line, or the one with ``#`` that has its default. A table that is there keeps its keys, and gets
+    those that it lacks. Raises Unchangeable.
     """
     rows = text.split("\n")
     wanted = copy.deepcopy(tomllib.loads(text))
@@ -44,8 +46,15 @@ def with_keys(text: str, table: str, lines: Mapping[str, NewLine]) -> str:
     if not isinstance(inside, dict):
         raise Unchangeable(f"[{table}] is no table")
     for name, line in lines.items():
-        inside[name] = line.value
-        rows = _with_key(rows, table, name, line)
+        if isinstance(before := inside.get(name), dict) and before:
+            new = line.value if isinstance(line.value, dict) else {"value": line.value}
+            added = {key: value for key, value in new.items() if key not in before}
+            before.update(added)
+            if added:
+                rows = _with_more(rows, table, name, NewLine(added, line.remark), wanted)
+        else:
+            inside[name] = line.value
+            rows = _with_key(rows, table, name, line)
     return _checked("\n".join(rows), wanted, table)
 
 
@@ -61,57 +70,53 @@ def with_delay(text: str, signal: str, delay: str, remark: str) -> str:
     if is_new:
         line = NewLine({"delay": delay}, remark)
         return _checked("\n".join(_with_key(rows, "signals", signal, line)), wanted, signal)
+    if before is None:
+        return "\n".join(_with_more(rows, "signals", signal, NewLine({"delay": delay}, remark), wanted))
     for number in _inside(rows, "signals") or ():
         if not _is_key(rows[number], signal):
             continue
-        row = rows[number]
-        ends = [match.start() for match in re.finditer(r"\}", row)] if before is None else [0]
-        for end in ends:
-            if before is None:
-                changed = f"{row[:end].rstrip()}, delay = {toml_value(delay)} {row[end:]}"
-            else:
-                changed = re.sub(r"(\bdelay\s*=\s*)(\"[^\"]*\"|'[^']*'|[^,}\s]+)", rf"\g<1>{toml_value(delay)}", row)
-            trial = "\n".join([*rows[:number], changed, *rows[number + 1 :]])
-            if _parsed(trial) == wanted:
-                return trial
-    try:
-        own = _with_key(rows, f"signals.{signal}", "delay", NewLine(delay, remark))
-        return _checked("\n".join(own), wanted, signal)
-    except ValueError as error:
-        raise Unchangeable(str(error)) from error
+        changed = re.sub(r"(\bdelay\s*=\s*)(\"[^\"]*\"|'[^']*'|[^,}\s]+)", rf"\g<1>{toml_value(delay)}", rows[number])
+        trial = "\n".join([*rows[:number], changed, *rows[number + 1 :]])
+        if _parsed(trial) == wanted:
+            return trial
+    own = _with_key(rows, f"signals.{signal}", "delay", NewLine(delay, remark))
+    return _checked("\n".join(own), wanted, signal)
 
 
 def write_machine_file(file: Path, text: str) -> None:
-    """Replace a machine file at once and whole, with its mode, if the daemon accepts ``text``.
+    """Replace a machine file at once and whole, with its owner and mode, if the daemon accepts ``text``.
+
+    A link stays; the file that it names is replaced.
 
     Raises:
         ConfigurationError: the daemon does not accept it.
-        ServiceError: the folder cannot be written.
+        ServiceError: the folder cannot be written, or this user cannot keep the owner.
     """
+    data, target = text.encode(), file.resolve()
     try:
         handle, name = tempfile.mkstemp(suffix=".toml", prefix=f".{file.stem}-", dir=file.parent)
     except OSError as error:
         raise ServiceError(f"{file.parent}: cannot be written: {error.strerror}") from error
     made = Path(name)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        try:
-            load_machine(made, for_replay=True)
-        except ConfigurationError as error:
-            raise ConfigurationError(str(error).replace(str(made), str(file))) from error
-        made.chmod(file.stat().st_mode & 0o777 if file.exists() else 0o644)
-        made.replace(file)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        load_machine(made, for_replay=True)
+    except ConfigurationError as error:
+        raise ConfigurationError(str(error).replace(str(made), str(file))) from error
     finally:
         made.unlink(missing_ok=True)
+    before = target.stat() if target.exists() else None
+    mode = 0o644 if before is None else before.st_mode & 0o777
+    replace_file(target, data, f".{target.name}.new", mode, before)
 
 
 def _with_key(rows: list[str], table: str, name: str, line: NewLine) -> list[str]:
-    remark = f"  {toml_comment(line.remark)}" if line.remark else ""
-    new = f"{toml_key(name)} = {toml_value(line.value)}{remark}"
+    end_of_line = "\r" if rows[0].endswith("\r") else ""  # rows are split at "\n"
+    new = f"{toml_key(name)} = {toml_value(line.value)}{_remark(line)}{end_of_line}"
     places = _inside(rows, table)
     if places is None:
-        return [*_without_blank_end(rows), "", f"[{table}]", new, ""]
+        return [*_without_blank_end(rows), end_of_line, f"[{table}]{end_of_line}", new, ""]
     same = [number for number in places if _is_key(rows[number], name)]
     default = [number for number in places if _is_key(rows[number].lstrip().removeprefix("#"), name)]
     if same or default:
@@ -120,6 +125,28 @@ def _with_key(rows: list[str], table: str, name: str, line: NewLine) -> list[str
     filled = [number for number in places if rows[number].strip()]
     end = (filled[-1] if filled else places.start - 1) + 1
     return [*rows[:end], new, *rows[end:]]
+
+
+def _with_more(rows: list[str], table: str, name: str, line: NewLine, wanted: Mapping[str, Any]) -> list[str]:
+    """Return the rows with more keys in a table within ``table``; ``wanted`` is the whole file then."""
+    keys = ", ".join(f"{toml_key(key)} = {toml_value(value)}" for key, value in line.value.items())
+    for number in _inside(rows, table) or ():
+        row = rows[number]
+        for match in re.finditer(r"\}", row) if _is_key(row, name) else ():
+            head, rest = row[: match.start()].rstrip().removesuffix(","), row[match.start() :]
+            end = rest if "#" in rest else f"{rest.rstrip()}{_remark(line)}{rest[len(rest.rstrip()) :]}"
+            trial = [*rows[:number], f"{head}, {keys} {end}", *rows[number + 1 :]]
+            if _parsed("\n".join(trial)) == wanted:
+                return trial
+    own = rows
+    for at, (key, value) in enumerate(line.value.items()):
+        own = _with_key(own, f"{table}.{name}", key, NewLine(value, "" if at else line.remark))
+    _checked("\n".join(own), wanted, name)
+    return own
+
+
+def _remark(line: NewLine) -> str:
+    return f"  {toml_comment(line.remark)}" if line.remark else ""
 
 
 def _without_blank_end(rows: list[str]) -> list[str]:

@@ -9,6 +9,7 @@ import click
 
 from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
 from otolith.cli.terminal import echo, echo_json
+from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
 
 if TYPE_CHECKING:
@@ -46,6 +47,10 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     else:
         lines = [*noise_lines(machine, record.noise), *structure_lines(machine, record.structure), ""]
         echo(*lines, *delay_lines(machine, record.delays))
+
+
+class UnusableData(ConfigurationError):  # noqa: N818 - it names the data
+    """Data of the healthy machine that are missing, cannot be read, or identify nothing."""
 
 
 class HealthyData(Protocol):
@@ -89,7 +94,6 @@ class HealthySpan:
         """See :class:`HealthyData`."""
         from otolith.runtime.replay import open_recordings
         from otolith.storage.recording_files import recording_file
-        from otolith_drivers.errors import ConfigurationError
         from otolith_drivers.replay.span import SpanReader
 
         names = machine.file.machine
@@ -130,11 +134,10 @@ class HealthyRecord:
 
 
 def identified_record(machine: "LoadedMachine", data: HealthyData, count: int) -> HealthyRecord:
-    """Identify delays, noise and structure from ``count`` windows; raise ConfigurationError if none can be used."""
+    """Identify delays, noise and structure from ``count`` windows; raise UnusableData if none can be used."""
     from otolith.commissioning.delays import identify_delays_and_noise, without_delays
     from otolith.commissioning.identification import identify_noise
     from otolith.commissioning.structure import remaining_structure
-    from otolith_drivers.errors import ConfigurationError
 
     with progress_line("reading") as show:
         declared = {name: table.delay for name, table in machine.signal_tables.items()}
@@ -152,29 +155,31 @@ def identified_record(machine: "LoadedMachine", data: HealthyData, count: int) -
     if machine.problem.open_loop:
         echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:
-        raise ConfigurationError(f"{data.path}: {'; '.join(identified.remarks)}")
+        raise UnusableData(f"{data.path}: {'; '.join(identified.remarks)}")
     return record
 
 
 def good_windows(machine: "LoadedMachine", data: HealthyData, count: int) -> list["Window"]:
-    """At most ``count`` good windows, spread over the data; raise ConfigurationError, with why, if there is none."""
+    """At most ``count`` good windows, spread over the data; raise UnusableData, with why, if there is none."""
     from otolith.runtime.preview import EvenSpread
     from otolith.runtime.replay import Replay
-    from otolith_drivers.errors import ConfigurationError
 
     reasons: tuple[str, ...] = ()
     spread = EvenSpread["Window"](count)
-    with data.opened(machine) as recorded:
-        run = Replay(machine, recorded)
-        for window in run.windows():
-            if window.quality.reasons:
-                reasons = window.quality.reasons
-            else:
-                spread.add(window)
-        echo_warnings(data.path, run.warnings())
+    try:
+        with data.opened(machine) as recorded:
+            run = Replay(machine, recorded)
+            for window in run.windows():
+                if window.quality.reasons:
+                    reasons = window.quality.reasons
+                else:
+                    spread.add(window)
+            echo_warnings(data.path, run.warnings())
+    except ConfigurationError as error:
+        raise UnusableData(str(error), error.key) from error
     if not (chosen := spread.chosen()):
         length = f"no window of {machine.file.window.length:g} s can be used"
-        raise ConfigurationError(f"{data.path}: {length}: {'; '.join(reasons) or 'the data is too short'}")
+        raise UnusableData(f"{data.path}: {length}: {'; '.join(reasons) or 'the data is too short'}")
     return chosen
 
 
