@@ -169,6 +169,27 @@ def test_a_person_ends_a_shelf(worn: Run) -> None:
     assert worn.state.shelves == {}
 
 
+@pytest.mark.parametrize("deed", [Deed.COMMENT, Deed.ACKNOWLEDGE])
+@pytest.mark.parametrize("by_person", [False, True])
+def test_no_other_note_hides_that_an_event_is_back(worn: Run, deed: Deed, *, by_person: bool) -> None:
+    worn.note(Deed.SHELVE, REASON, seconds=500.0 * LENGTH if by_person else 2.5 * LENGTH)
+    worn.windows(2, WORN)
+    if by_person:
+        worn.note(Deed.UNSHELVE)
+    worn.note(deed, "seen")
+    (change,) = worn.windows(1, WORN)
+    assert (change.change, change.is_silent, change.shelved) == (EventChange.UNSHELVED, False, None)
+    assert (change.acknowledged or (change.comments or (None,))[-1]) is not None
+
+
+def test_what_is_shelved_again_at_once_is_not_back(worn: Run) -> None:
+    worn.note(Deed.SHELVE, REASON, seconds=2.5 * LENGTH)
+    worn.windows(2, WORN)
+    worn.note(Deed.SHELVE, REASON, seconds=100.0 * LENGTH)
+    (change,) = worn.windows(1, WORN)
+    assert (change.change, change.is_silent) == (EventChange.SHELVED, True)
+
+
 def test_a_person_ends_a_shelf_without_an_open_event(worn: Run) -> None:
     worn.note(Deed.SHELVE, REASON, seconds=500.0 * LENGTH)
     worn.windows(1, WORN)

@@ -95,9 +95,7 @@ def noted(
         event = event.model_copy(update={"acknowledged": None})
     if shelf is not None and not shelf.hides(event, now):
         shelf = None
-    change = event.change
-    if event.shelved is not None and shelf is None:
-        change = change or EventChange.UNSHELVED
+    change, was_shelved = None, event.shelved is not None
     for note in notes:
         own = note.document
         if note.deed is Deed.SHELVE and not Shelf(own, event.state, event.condition_id).lasts(now):
@@ -108,8 +106,11 @@ def noted(
             event = commented(event, own)
         else:
             shelf = Shelf(own, event.state, event.condition_id) if note.deed is Deed.SHELVE else None
-        change = event.change or CHANGES[note.deed]
-    return event.model_copy(update={"change": change, "shelved": shelf and shelf.note}), shelf
+            was_shelved = was_shelved or note.deed is Deed.UNSHELVE
+        change = CHANGES[note.deed]
+    if was_shelved and shelf is None:  # whatever else was done with it: persons are told that it is back
+        change = EventChange.UNSHELVED
+    return event.model_copy(update={"change": event.change or change, "shelved": shelf and shelf.note}), shelf
 
 
 def _is_other(event: EventDocument, before: EventDocument) -> bool:
