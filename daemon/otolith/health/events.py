@@ -59,6 +59,12 @@ class ConditionRecord:
     persistence: Persistence = field(default_factory=Persistence)
     cleared: int = -RETURN_WINDOWS  # Index of the window that ended its last event
     others: tuple[str, ...] = ()  # Ids of the conditions by which the last windows describe the event otherwise
+    limit: float | None = None  # Value of the limit that decided the level; None without one, and in older files
+
+    @property
+    def held(self) -> float | None:
+        """The value of the limit that holds the level; in older files it is that of the last window that showed one."""
+        return self.event.evidence.limit if self.limit is None and self.event is not None else self.limit
 
     def is_over(self, window: int) -> bool:
         """Whether nothing of it has to be carried on after the window with this index."""
@@ -236,7 +242,7 @@ def _observations(
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
-    held = {key: record.event.evidence.limit for key, record in state.records.items() if record.event is not None}
+    held = {key: record.held for key, record in state.records.items()}
     past = Past(state.steps, spans, state.trends, state.undetermined, held, state.doubtful, state.known_since)
     shown = observe(plan, report, levels, past)
     return earlier | {item.key: item for item in shown}
@@ -412,7 +418,22 @@ def _advance(
             described = described.model_copy(update={"change": EventChange.CHANGED})
         event = described if is_other or not others else event
     kept = recent[-count:] if level.rank < before.level.rank else recent  # what is over does not count again
-    return ConditionRecord(level, kept, event, observed.persistence, before.cleared, others)
+    limit = _deciding_limit(before, observed, level, event)
+    return ConditionRecord(level, kept, event, observed.persistence, before.cleared, others, limit)
+
+
+def _deciding_limit(
+    before: ConditionRecord, observed: Observation, level: Level, event: EventDocument | None
+) -> float | None:
+    """Return the value of the limit that decides ``level`` after an observation.
+
+    A window at another level does not change what holds the present one: it may be the only such window.
+    """
+    if event is None or level is Level.OK:
+        return None
+    if observed.level is level and observed.limit is not None:
+        return observed.limit
+    return before.held if level is before.level else event.evidence.limit
 
 
 def _ended(plan: MonitoringPlan, event: EventDocument, now: float) -> EventDocument:

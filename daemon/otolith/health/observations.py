@@ -71,6 +71,12 @@ class Observation:
     numbers: Mapping[str, float | str] | None = None  # For the evidence of the event
     persistence: Persistence = Persistence()
 
+    @property
+    def limit(self) -> float | None:
+        """Value of the limit that decides the level; None without one."""
+        limit = (self.numbers or {}).get("limit")
+        return limit if isinstance(limit, float) else None
+
 
 @dataclass(frozen=True, slots=True)
 class Past:
