@@ -100,6 +100,6 @@ def test_the_event_of_a_clock_that_was_set_says_by_how_much() -> None:
 
 def test_the_event_of_a_certificate_names_it_and_its_end_in_each_language() -> None:
     for language in ("en", "de"):
-        event = expiry_event(START, "press.crt", "2027-01-31", 7, language)
+        event = expiry_event(START, "press.crt", 1_801_353_600.0, 7, language)
         assert (event.change, event.end, event.state, event.part) == (EventChange.NOTED, START, Level.OK, "daemon")
         assert_says(event_text(event), "press.crt", "2027-01-31")

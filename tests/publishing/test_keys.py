@@ -4,6 +4,7 @@ import re
 import resource
 import socket
 from contextlib import closing
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -13,23 +14,29 @@ from cryptography.hazmat.primitives import serialization
 
 from otolith.cli.demo import _refuse_busy
 from otolith.cli.main import cli
+from otolith.health.labels import expiry_event
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
-from otolith.publishing.publisher import NOTICE_DAYS, Publisher
+from otolith.publishing.publisher import Publisher
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import (
+    NOTICE_DAYS,
     SOCKET,
     Access,
     Connection,
     Credentials,
+    Validity,
     listening,
     local_sockets,
     reader_settings,
 )
+from otolith.storage.history import history_path
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.conftest import free_port
 from tests.health.test_events import report
 from tests.messages import raises_saying
+from tests.storage.histories import document
 from tests.waiting import wait_for
 
 ENDPOINT = "tls/press.local:7447"
@@ -181,8 +188,46 @@ def test_a_daemon_that_runs_for_years_warns_of_its_certificate(site: Path, caplo
         assert noticed == [CERTIFICATE_DAYS - before for before in NOTICE_DAYS]
         publisher.warn_of_expiry(utc_now() + timedelta(days=CERTIFICATE_DAYS + 1))
         assert "own.crt: expired on " in caplog.text
+        replaced = replace(publisher._validity, end=utc_now() + timedelta(days=CERTIFICATE_DAYS + 400))
+        publisher._validity = replaced  # by another, which is told of as well
+        assert publisher.expiry_notice(utc_now() + timedelta(days=CERTIFICATE_DAYS + 375)) == replaced
     finally:
         publisher.close()
+
+
+@pytest.mark.parametrize(("days", "renewed"), [(1, 1 / 3), (7, 6), (14, 14 / 3), (47, 47 / 3), (90, 30), (365, 31)])
+def test_a_certificate_that_an_authority_renews_by_itself_is_not_warned_of(days: int, renewed: float) -> None:
+    """``renewed`` days before its end."""
+    end = utc_now()
+    validity = Validity(Path("own.crt"), end, timedelta(days=days))
+    assert validity.warning(end - timedelta(days=renewed)) == ""
+    for left in validity.notices:  # but if it is not renewed
+        assert "expires on" in validity.warning(end - 0.99 * left)
+    assert "expired on" in validity.warning(end + timedelta(hours=1))
+
+
+@pytest.mark.parametrize("days", [20.0, 5.0])
+def test_a_daemon_that_starts_again_does_not_repeat_a_notice(site: Path, days: float) -> None:
+    make_certificate(site, "own", ["127.0.0.1"], utc_now() - timedelta(days=CERTIFICATE_DAYS - days))
+    tls = TlsTable(ca=Path("ca.crt"), certificate=Path("own.crt"), key=Path("own.key"))
+    own, now = Access(ZenohTable(tls=tls), site / "machine.toml"), utc_now()
+    archive, time = HistoryWriter(history_path("hall-1", "press-3"), Bounds(20_000_000, 3650, 24)), now.timestamp()
+    numbers, _ = archive.open(time)
+
+    def notice(after: float) -> Validity | None:
+        endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        with closing(Publisher("hall-1", "press-3", [endpoint], own, archive)) as publisher:
+            return publisher.expiry_notice(now + timedelta(days=after))
+
+    told = notice(0.0)
+    assert told is not None
+    assert told.end is not None
+    raised = expiry_event(time, str(told.certificate), told.end.timestamp(), 0, "en")
+    archive.add(numbers.number(document(0, time).model_copy(update={"events": (raised,)})))
+    archive._write_waiting()
+    assert [notice(after) for after in (0.0, 1.0)] == [None, None]
+    assert (notice(14.0) == told) == (days == 20.0)  # within the last week
+    archive._close()
 
 
 def test_an_encrypted_endpoint_needs_certificates(site: Path) -> None:

@@ -5,6 +5,8 @@ daemon with Unix times. If the clock turns out to have been wrong, the labels ch
 """
 
 from bisect import bisect_right
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -21,7 +23,10 @@ from otolith.health.schema import (
     ReportDocument,
 )
 from otolith.health.text import texts_in
+from otolith.health.times import moment_text
 from otolith_drivers.config_files import DocumentModel
+
+CERTIFICATE = "certificate"
 
 # Thresholds: docs/reference/thresholds-health.md has the origin of each.
 MAX_SPANS = 200  # of different labels; of more, the two neighbours that differ least become one
@@ -144,11 +149,21 @@ def clock_event(time: float, by: float, window: int, language: Language) -> Even
     return _noted(CLOCK, time, text, evidence, language)
 
 
-def expiry_event(time: float, certificate: str, end: str, window: int, language: Language) -> EventDocument:
-    """Return the event that a ``certificate`` of the daemon expires on the date ``end``, at a service time."""
-    text = texts_in(language)("certificate_expires", certificate=certificate, end=end)
-    event = _noted("certificate", time, text, EvidenceDocument(windows=(window, window)), language)
-    return event.model_copy(update={"part": DAEMON})
+def expiry_event(time: float, certificate: str, end: float, window: int, language: Language) -> EventDocument:
+    """Return the event that a ``certificate`` of the daemon expires at ``end`` (Unix s), at a service time."""
+    text = texts_in(language)("certificate_expires", certificate=certificate, end=moment_text(end, "UTC")[:10])
+    event = _noted(CERTIFICATE, time, text, EvidenceDocument(windows=(window, window)), language)
+    return event.model_copy(update={"id": f"{CERTIFICATE}/{end:.0f}@{time:.1f}", "part": DAEMON})
+
+
+def expiry_notices(events: Iterable[EventDocument]) -> dict[float, float]:
+    """Return when :func:`expiry_event` was last given, by the end of the certificate; all in Unix seconds."""
+    notices: dict[float, float] = {}
+    for event in events:
+        if event.condition_id == CERTIFICATE:
+            with suppress(ValueError):  # an earlier version gave no end
+                notices[float(event.id.rpartition("@")[0].removeprefix(f"{CERTIFICATE}/"))] = event.start
+    return notices
 
 
 def _noted(key: str, time: float, text: str, evidence: EvidenceDocument, language: Language) -> EventDocument:

@@ -53,8 +53,8 @@ def authorities(path: Path, key: Key) -> list[x509.Certificate]:
         raise ConfigurationError(f"{path}: not a certificate in PEM form", key) from error
 
 
-def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str], now: datetime) -> datetime:
-    """Check certificate and key; return until when the certificate is valid.
+def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str], now: datetime) -> x509.Certificate:
+    """Check certificate and key; return the certificate.
 
     ``keys`` name CA, certificate and private key for the error. ``hosts`` are the names or addresses where it listens.
 
@@ -85,7 +85,7 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     if now > own.not_valid_after_utc:
         expired = f"expired on {own.not_valid_after_utc:%Y-%m-%d}"
         raise NotValidNowError(f"{name}: {expired}; 'otolith keys renew' makes another", at_certificate)
-    return own.not_valid_after_utc
+    return own
 
 
 def _private_key(path: Path, key: Key) -> PrivateKeyTypes:

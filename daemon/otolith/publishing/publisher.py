@@ -5,16 +5,18 @@ tries the rest again. It also looks whether certificates or passwords were repla
 """
 
 import logging
+import math
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta
 
 import zenoh
 
+from otolith.health.labels import expiry_notices
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
-from otolith.publishing.zenoh_config import ENCRYPTED, Access, Settings, Validity, listening
+from otolith.publishing.zenoh_config import ENCRYPTED, NOTICE_DAYS, Access, Settings, Validity, listening
 from otolith.publishing.zenoh_session import (
     ALIVE,
     EVENT,
@@ -36,7 +38,6 @@ log = logging.getLogger(__name__)
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 FIRST_RETRY, MAX_RETRY = 1.0, 30.0  # s from an endpoint that could not be opened to the next try; it doubles
 RENEWAL_INTERVAL = 60.0  # s between two looks at the files of certificates and passwords
-NOTICE_DAYS = (30, 7)  # days before a certificate expires at which that is an event
 CLOSE_WAIT = 1.0  # s for a try that has begun
 RENEWAL = "its session is opened anew"  # Why endpoints wait whose files were replaced
 UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; everything else is a mistake
@@ -94,7 +95,8 @@ class Publisher:
         self._latest: str | None = None
         self._start: str | None = None
         self._validity, self._warned_on = Validity(), date.min
-        self._noticed: tuple[datetime | None, int] = (None, 0)  # End of validity, and days, of the last notice
+        # When it was last told that a certificate expires, by its end; Unix s
+        self._noticed = {} if access.zenoh.tls is None else _notices(archive)
         self._refused = ""  # Why files that were replaced cannot be used
         self._sessions: tuple[_Session, ...] = ()
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
@@ -159,15 +161,15 @@ class Publisher:
         return self._validity.warning(now)
 
     def expiry_notice(self, now: datetime) -> Validity | None:
-        """Return the validity of the certificate once on each of ``NOTICE_DAYS`` before it ends."""
+        """Return the validity of the certificate once after each of its ``notices`` was reached."""
         validity = self._validity
         if validity.end is None or now > validity.end:
             return None
-        left = (validity.end - now).total_seconds() / 86_400.0
-        days = min((days for days in NOTICE_DAYS if left <= days), default=0)
-        if not days or self._noticed == (validity.end, days):
+        end = validity.end.timestamp()
+        reached = min((rest for rest in validity.notices if validity.end - now <= rest), default=None)
+        if reached is None or end - self._noticed.get(end, -math.inf) <= reached.total_seconds():
             return None
-        self._noticed = validity.end, days
+        self._noticed[end] = now.timestamp()
         return validity
 
     def close(self) -> None:
@@ -311,3 +313,13 @@ class Publisher:
             start = self._start
         with query:
             answer(query, START.under(self._site, self._machine), "start", start, None)
+
+
+def _notices(archive: HistoryWriter | None) -> dict[float, float]:
+    """Return when daemons before this one told that a certificate expires, by its end (Unix s), by the history."""
+    if archive is None:
+        return {}
+    try:
+        return expiry_notices(archive.reader.events((datetime.now(UTC) - timedelta(days=max(NOTICE_DAYS))).timestamp()))
+    except OtolithError:  # an unreadable history must not prevent monitoring
+        return {}

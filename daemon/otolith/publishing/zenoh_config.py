@@ -26,7 +26,9 @@ HANDSHAKE_TIMEOUT = 2000  # ms
 TLS_TIMEOUT = 600_000  # ms for the TLS handshake, before that of Zenoh: one that fails stops Zenoh for 0.1 s
 MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens with TLS
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
-EXPIRY_WARNING = timedelta(days=30)  # rest of the validity of a certificate from which the log warns
+NOTICE_SHARES = (0.25, 0.1)  # rests of a certificate's lifetime from which people are told of its end, ...
+NOTICE_DAYS = (30, 7)  # ... but at most these
+SHORT_LIVED_DAYS = 14  # lifetime up to which only the last of them counts
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux
 
 Settings = dict[str, object]  # Keys of Zenoh's configuration and their values
@@ -56,10 +58,18 @@ class Validity:
 
     certificate: Path = Path()
     end: datetime | None = None
+    lifetime: timedelta = timedelta()
+
+    @property
+    def notices(self) -> tuple[timedelta, ...]:
+        """The rests of the validity from which people are told; an authority that renews by itself does so before."""
+        rests = zip(NOTICE_SHARES, NOTICE_DAYS, strict=True)
+        notices = tuple(min(share * self.lifetime, timedelta(days=days)) for share, days in rests)
+        return notices[-1:] if self.lifetime <= timedelta(days=SHORT_LIVED_DAYS) else notices
 
     def warning(self, now: datetime) -> str:
         """Return that it expires soon or has expired; else an empty text."""
-        if self.end is None or self.end - now >= EXPIRY_WARNING:
+        if self.end is None or self.end - now >= self.notices[0]:
             return ""
         time = f"{'expired' if now > self.end else 'expires'} on {self.end:%Y-%m-%d}"
         return (
@@ -111,18 +121,20 @@ class Access:
         hosts = [host_of(endpoint) for endpoint in listen if endpoint.startswith(ENCRYPTED)]
         keys = [("zenoh", "tls", name) for name in ("ca", "certificate", "key")]
         try:
-            validity = Validity(identity.certificate, check_identity(identity, keys, hosts, utc_now()))
+            own = check_identity(identity, keys, hosts, utc_now())
         except NotValidNowError:
             if encrypted:
                 raise
             return {}, Validity()
-        own = {
+        end = own.not_valid_after_utc
+        validity = Validity(identity.certificate, end, end - own.not_valid_before_utc)
+        files = {
             f"{side}_{kind}": str(path)
             for side in ("listen", "connect")
             for kind, path in (("certificate", identity.certificate), ("private_key", identity.key))
         }
         return {
-            TLS: {**own, "root_ca_certificate": str(identity.ca), "enable_mtls": table.clients, **_VERIFIED}
+            TLS: {**files, "root_ca_certificate": str(identity.ca), "enable_mtls": table.clients, **_VERIFIED}
         }, validity
 
     def _passwords(self) -> Settings:

@@ -501,9 +501,10 @@ class Service:
     def _warn_of_expiry(self, publisher: Publisher, now: datetime) -> None:
         """Log that the certificate of an endpoint expires soon, and note it in the next report."""
         publisher.warn_of_expiry(now)
-        if (notice := publisher.expiry_notice(now)) is not None:
-            names, language = (str(notice.certificate), f"{notice.end:%Y-%m-%d}"), self._machine.file.machine.language
-            self._noted = (*self._noted, expiry_event(self._clock.now(), *names, self._windows, language))
+        if (notice := publisher.expiry_notice(now)) is not None and notice.end is not None:
+            name, language = str(notice.certificate), self._machine.file.machine.language
+            event = expiry_event(self._clock.now(), name, notice.end.timestamp(), self._windows, language)
+            self._noted = (*self._noted, event)
 
     def _save(self, now: float) -> None:
         """Request a save if components or open events have changed, or the last save is ``SAVE_INTERVAL`` ago.
