@@ -298,7 +298,7 @@ def test_a_component_is_forgotten_if_it_was_found_before_the_operator_said_so(
     running.run(1)
     (key,) = {known.component.key for known in supervisor.state.adopted}
     moment = found + 60.0 if is_forgotten else found - 60.0
-    running.service._store.save_decisions(OperatorDecisions(forgotten={key: moment}))
+    running.service._store.operator.write(OperatorDecisions(forgotten={key: moment}))
     running.stop()
     arguments = ["components", "list", str(running.machine.path)]
     shown = [

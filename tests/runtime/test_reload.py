@@ -108,7 +108,7 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     path.write_text(text, encoding="utf-8")
     service = Service(load_machine(path))
     store = store_of(service._machine)
-    store.save_decisions(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
+    store.operator.write(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
     path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
     service._reload()
     limited = service._supervisor._next_state().plan.parameters["R_a"]

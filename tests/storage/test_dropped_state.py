@@ -19,6 +19,7 @@ from otolith.adaptation.state import (
     apply_decisions,
     initial_state,
 )
+from otolith.cli.commissioning.commission import _review
 from otolith.cli.main import cli
 from otolith.cli.operation.live_table import LiveTable
 from otolith.health.events import HealthState, assess
@@ -183,6 +184,27 @@ def test_another_twin_clears_the_events_of_the_one_before(motor: LoadedMachine, 
     german = replace(motor.plan, language="de")
     _, document = assess(german, state.health, document.model_copy(update={"events": ()}))
     assert all("Zwilling" in event_text(event) for event in document.events)
+
+
+def test_notes_that_were_taken_over_are_so_also_where_a_state_is_refused(
+    motor: LoadedMachine, store: StateStore
+) -> None:
+    state = warm(motor, store)
+    store.save(replace(state, health=replace(state.health, taken=("a", "b"))))
+    edited = replace(motor.twin, parameters=motor.twin.parameters[::-1])
+    other = StateStore(state.site, state.machine, edited, store.components_path.parent)
+    assert other.taken() == ("a", "b")
+    refused, note = other.restore(cold(motor))
+    assert "twin has changed" in note
+    assert refused.health.taken == ("a", "b")
+
+
+def test_a_commissioning_keeps_which_notes_were_taken_over(motor: LoadedMachine, store: StateStore) -> None:
+    state = warm(motor, store)
+    store.save(replace(state, health=replace(state.health, taken=("a", "b"))))
+    _review(motor, store, state, (), decide=lambda: True)
+    again, note = store.restore(cold(motor))
+    assert (note, again.health.taken, again.health.open_events) == ("", ("a", "b"), ())
 
 
 def published(event: EventDocument, **update: object) -> EventDocument:

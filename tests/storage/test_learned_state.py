@@ -277,7 +277,7 @@ def test_a_file_of_other_content_is_kept_and_the_reason_is_given(content: bytes,
 def refuse_text(store: StateStore, content: bytes, reason: str) -> None:
     """Check that the content of the file is refused for ``reason``, and kept beside what is saved afterwards."""
     store.components_path.write_bytes(content)
-    store.save_decisions(OperatorDecisions(approved=frozenset({UNBALANCE})))
+    store.operator.write(OperatorDecisions(approved=frozenset({UNBALANCE})))
     initial = fresh()
     state, note = store.restore(initial)
     assert state.posterior is initial.posterior
@@ -472,7 +472,7 @@ def test_a_component_and_everything_are_reset() -> None:
 def test_records_are_those_that_commissioning_keeps(tmp_path: Path) -> None:
     """Components saved alone are not subject to an earlier reset of everything."""
     store = store_in(tmp_path)
-    store.save_decisions(OperatorDecisions(resets={EVERYTHING: 5.0}))
+    store.operator.write(OperatorDecisions(resets={EVERYTHING: 5.0}))
     store.save_components(component_records(unbalanced()))
     state = apply_decisions(store.restore(fresh())[0], store.decisions())
     assert [component.key for component in state.problem.components] == [UNBALANCE]

@@ -68,7 +68,7 @@ def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: S
     assert writer.new_decisions() is None
     key = frozenset({FRICTION.key})
     for decisions in (OperatorDecisions(approved=key), OperatorDecisions(rejected=key)):
-        store.save_decisions(decisions)
+        store.operator.write(decisions)
         received: list[OperatorDecisions] = []
 
         def has_changed(received: list[OperatorDecisions] = received) -> bool:
@@ -82,7 +82,7 @@ def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: S
 
 
 def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> None:
-    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+    store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
     writer = StateWriter(store, store.operator.time())
     writer.start()
     writer.save(STATE)
@@ -102,7 +102,7 @@ def test_callers_do_not_wait_for_a_disk_that_hangs(
         answers.wait(PATIENCE)
         return OperatorDecisions()
 
-    store.save_decisions(OperatorDecisions())
+    store.operator.write(OperatorDecisions())
     monkeypatch.setattr(store, "decisions", hang)
     assert is_read.wait(PATIENCE)
     begun = time.monotonic()
@@ -161,7 +161,7 @@ def test_no_error_ends_the_thread_and_decisions_are_read_after_it(
         patch.setattr(store, "save", fail)
         writer.save(STATE)
         wait_for(lambda: "what was learned is not saved: MemoryError" in caplog.text)
-        store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+        store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
         wait_for(lambda: writer.new_decisions() is not None)
     writer.stop(PATIENCE)
     assert store.components() == SAVED
@@ -326,7 +326,7 @@ def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(
     monkeypatch.setattr(os, "fchown", swap_and_give)
     monkeypatch.setattr(os, "chown", refuse)
     before = victim.stat()
-    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+    store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
     assert given
     assert before.st_ino not in given
     assert (victim.stat().st_uid, victim.read_text(encoding="utf-8")) == (before.st_uid, "of root")
@@ -336,7 +336,7 @@ def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(
 def test_what_root_writes_belongs_to_the_user_of_the_daemon(store: StateStore) -> None:
     folder = store.decisions_path.parent
     os.chown(folder.parent, 12345, 12345)
-    store.save_decisions(OperatorDecisions())
+    store.operator.write(OperatorDecisions())
     with store.locked():
         owners = {path.stat().st_uid for path in (folder, store.decisions_path, store.lock_path)}
     assert owners == {12345}
@@ -347,7 +347,7 @@ def test_nothing_is_written_through_a_folder_that_was_replaced_by_a_link(store: 
     elsewhere.mkdir()
     store.components_path.parent.symlink_to(elsewhere)
     with pytest.raises(ServiceError):
-        store.save_decisions(OperatorDecisions())
+        store.operator.write(OperatorDecisions())
     with pytest.raises(ServiceError):
         store.save(STATE)
     assert list(elsewhere.iterdir()) == []

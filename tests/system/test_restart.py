@@ -138,7 +138,7 @@ def test_a_second_daemon_of_the_same_name_ends_with_an_error(start: Start, healt
 
 @pytest.mark.full
 def test_a_file_that_is_refused_is_published_and_kept_with_the_decisions(start: Start, store: StateStore) -> None:
-    store.save_decisions(OperatorDecisions(rejected=frozenset({"shaft/Coulomb/omega"})))
+    store.operator.write(OperatorDecisions(rejected=frozenset({"shaft/Coulomb/omega"})))
     store.components_path.write_text('{"version": 99}', encoding="utf-8")
     running = start()
     (report, *_) = running.wait_for(lambda reports: len(reports) >= 1)

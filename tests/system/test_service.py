@@ -185,7 +185,7 @@ def test_components_are_saved_and_decisions_apply_at_run_time(
     assert [component.id for component in first[0].components] == [FRICTION.key]
     assert f"started with saved components: {FRICTION.key}; 'otolith components forget'" in running.log.read_text()
     store.components_path.unlink()
-    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+    store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
     running.wait_for(lambda reports: all(each.status is not Status.INVALID for each in reports[-1].parameters.values()))
     code, seconds = running.stop()

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+from otolith.health.events import HealthState
 from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import History
 from otolith.machine import LoadedMachine
@@ -153,6 +154,15 @@ class StateStore:
         learned = self._learned()
         return {} if learned is None else dict(learned.health.histories)
 
+    def taken(self) -> tuple[str, ...]:
+        """Return the ids of the notes that the daemon of this machine has taken over, whatever else it learned."""
+        for path in (self.components_path, self.earlier_path):
+            with contextlib.suppress(OtolithError):
+                learned = read_model(path, LearnedState, VERSION)
+                if learned is not None and (learned.machine, learned.site) == (self._machine, self._site):
+                    return learned.health.taken
+        return ()
+
     def labels(self) -> TimeLabels:
         """Return the Unix times of the times in the saved state."""
         clock, _ = self.saved_clock()
@@ -228,6 +238,8 @@ class StateStore:
                     return state, reason, False
                 events = (*learned.health.dropped, *learned.health.open_events)
                 health = state.health.with_dropped(events, f"what was learned is not used: {reason}")
+                # Without what was taken over, the next report would have those notes again.
+                health = replace(health, notes=learned.health.notes, taken=learned.health.taken)
                 return replace(state, health=health), reason, False
             if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
                 reason = "parameters or noise in the machine file have changed since it was saved"
@@ -265,8 +277,11 @@ class StateStore:
             raise ServiceError(f"{self.components_path}: kept as it was: {reason_of(error)}") from error
         self._write_learned(learned)
 
-    def save_components(self, components: tuple[ComponentRecord, ...]) -> None:
-        """Write nothing but components; resets until now do not concern them. Raises as :meth:`save`."""
+    def save_components(self, components: tuple[ComponentRecord, ...], taken: tuple[str, ...] = ()) -> None:
+        """Write nothing but components and which notes were ``taken`` over; raises as :meth:`save`.
+
+        Resets until now do not concern the components.
+        """
         learned = LearnedState(
             machine=self._machine,
             site=self._site,
@@ -275,6 +290,7 @@ class StateStore:
             twin_fingerprint=twin_fingerprint(self._twin),
             resets=dict(self.decisions().resets),
             components=components,
+            health=HealthState(taken=taken),
         )
         self._write_learned(learned)
 
@@ -304,10 +320,6 @@ class StateStore:
     def decisions(self) -> OperatorDecisions:
         """Return the operator's decisions; raises as :meth:`DecisionsFile.read`."""
         return self.operator.read()
-
-    def save_decisions(self, decisions: OperatorDecisions) -> None:
-        """Write the decisions, whatever they were before; raises as :meth:`DecisionsFile.write`."""
-        self.operator.write(decisions)
 
 
 class StateWriter(WriterThread):

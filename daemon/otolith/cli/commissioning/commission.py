@@ -15,7 +15,7 @@ from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
-    from otolith.adaptation.state import AdaptationState, ComponentRecord
+    from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
     from otolith.cli.commissioning.machine_lines import NewLine
     from otolith.cli.commissioning.noise import HealthyData
     from otolith.commissioning.delays import IdentifiedDelays
@@ -342,9 +342,10 @@ def _review(
     precise = {key_of_record(record): record for record in pooled}
     records = tuple(precise.get(key_of_record(record), record) for record in component_records(state))
     approved, rejected = asked(machine, records, decide=decide)
+    taken = store.taken()
     if store.components_path.exists():
         echo(f"what was learned before is kept as {store.set_aside()}", err=True)
-    store.save_components(tuple(record for record in records if key_of_record(record) in approved))
+    store.save_components(tuple(record for record in records if key_of_record(record) in approved), taken)
     _decide(store, approved, rejected)
     if not records:
         echo("no component was found: the twin explains the machine up to the noise", err=True)
@@ -374,9 +375,11 @@ def asked(
 
 
 def _decide(store: "StateStore", approved: set[str], rejected: set[str]) -> None:
-    decisions = store.decisions()
-    rejected = {*decisions.rejected, *rejected} - approved
-    store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
+    def changed(decisions: "OperatorDecisions") -> "OperatorDecisions":
+        rest = (decisions.rejected | rejected) - approved
+        return replace(decisions, approved=decisions.approved | approved, rejected=rest)
+
+    store.operator.change(changed)
 
 
 def ask_if_healthy() -> bool:
@@ -488,7 +491,7 @@ def baseline(file: Path, clear: bool) -> None:
     """
     machine, store = loaded(file)
     if clear:
-        store.save_decisions(replace(store.decisions(), baselines={}))
+        store.operator.change(lambda before: replace(before, baselines={}))
         echo("limits in percent refer to the nominal values of the machine file")
     else:
         keep_baseline(machine, store, store.histories(), {})
@@ -518,7 +521,7 @@ def keep_baseline(
     if labels is not None:
         kept = {name: replace(item, end=labels.last(item.end)) for name, item in kept.items()}
     if kept:
-        store.save_decisions(replace(store.decisions(), baselines={**store.decisions().baselines, **kept}))
+        store.operator.change(lambda before: replace(before, baselines={**before.baselines, **kept}))
     lines = list[str]()
     for name, search in found.items():
         if (item := kept.get(name)) is not None:

@@ -142,12 +142,16 @@ def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorD
     from otolith_drivers.errors import ConfigurationError, nearest
 
     _, store = loaded(file)
-    decisions = store.decisions()
-    known = {key_of_record(record) for record in store.components()} | decisions.approved | decisions.rejected
-    if component not in known:
-        raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
-    rest = replace(decisions, approved=decisions.approved - {component}, rejected=decisions.rejected - {component})
-    store.save_decisions(add(rest))
+    found = {key_of_record(record) for record in store.components()}
+
+    def changed(decisions: "OperatorDecisions") -> "OperatorDecisions":
+        known = found | decisions.approved | decisions.rejected
+        if component not in known:
+            raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
+        undecided = {"approved": decisions.approved - {component}, "rejected": decisions.rejected - {component}}
+        return add(replace(decisions, **undecided))
+
+    store.operator.change(changed)
     echo(f"{component} is {decision}")
 
 
@@ -173,7 +177,7 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
     from otolith_drivers.errors import ConfigurationError, OtolithError, nearest
 
     machine, store = loaded(file)
-    decisions, known = store.decisions(), [parameter.name for parameter in machine.problem.free]
+    known = [parameter.name for parameter in machine.problem.free]
     try:
         known += map(key_of_record, store.components())
     except OtolithError as error:
@@ -183,7 +187,7 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
             raise ConfigurationError(f"no parameter or component {name!r}: {nearest(name, known)}")
     if not dry_run:
         times = dict.fromkeys(names or (EVERYTHING,), time.time())
-        store.save_decisions(replace(decisions, resets={**decisions.resets, **times}))
+        store.operator.change(lambda before: replace(before, resets={**before.resets, **times}))
     echo(*(f"{name} {'would be' if dry_run else 'is'} forgotten" for name in names or known))
 
 
