@@ -32,13 +32,20 @@ def always(history: History, now: float) -> ForecastDocument:
     return ForecastDocument(computed=now, watch=crossing)
 
 
-def seen(value: Callable[[float], float], days: float, *, fitted: bool = False) -> list[SeenTrend]:
-    """Return each trend that lasted, until ``value`` of a time passes WATCH or the days are over."""
+def seen(
+    value: Callable[[float], float], days: float, *, fitted: bool = False, step: float = STEP, run: float = math.inf
+) -> list[SeenTrend]:
+    """Return each trend that lasted, until ``value`` of a time passes WATCH or the days are over.
+
+    Estimates come every ``step`` s, and in the first ``run`` s of every two hours only.
+    """
     random, lasting = np.random.default_rng(5), list[SeenTrend]()
     history: History = ()
     own: ForecastDocument | None = None
     before: SeenTrend | None = None
-    for now in np.arange(0.0, days * DAY, STEP).tolist():
+    for now in np.arange(0.0, days * DAY, step).tolist():
+        if now % (2.0 * HOUR) >= run:
+            continue
         if abs(value(now) - 1.0) > LIMIT:
             break
         history = with_point(history, now, value(now) + SD * random.standard_normal(), SD**2)
@@ -77,6 +84,21 @@ def test_wear_is_announced_before_the_limit_also_under_a_load_cycle(hours: float
     lasting = seen(worn, 2.0 + 2.0 * hours / 24.0)
     assert lasting
     assert lasting[0].since > 2.0 * DAY
+
+
+@pytest.mark.parametrize(("step", "run"), [(2.0 * HOUR, math.inf), (8.0 * HOUR, math.inf), (300.0, 1200.0)])
+def test_wear_is_announced_on_a_machine_that_seldom_moves(step: float, run: float) -> None:
+    """Its estimates are hours apart, or it rests for most of each two hours."""
+    lasting = seen(lambda time: 1.0 + LIMIT * max(time - 10.0 * DAY, 0.0) / (20.0 * DAY), 30.0, step=step, run=run)
+    assert lasting
+    assert lasting[0].since > 10.0 * DAY
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("step", [2.0 * HOUR, 5.0 * HOUR])
+def test_a_load_cycle_is_no_trend_of_a_machine_that_seldom_moves(shape: str, step: float) -> None:
+    """It covers most of the way to the limit."""
+    assert seen(lambda time: 1.0 + 0.02 * SHAPES[shape](time / DAY), 20.0, step=step) == []
 
 
 def test_a_trend_is_over_a_day_after_it_was_last_seen() -> None:

@@ -53,6 +53,7 @@ MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a lim
 MIN_WAY = 0.5  # of the way from the healthy value to a limit, that the value must have gone
 MIN_BEYOND = 0.1  # of that way, by which it must be further than in the older half of its history
 HOLD, MAX_HOLD = 0.05, 3600.0  # of the length of the history, and s: for which this must be so, the shorter one
+MIN_SEEN = 3  # estimates that must show it meanwhile, however far they are apart
 QUIET = 86400.0  # s without it, after which it is over: a day, the longest cycle of most loads
 BISECTIONS = 40  # of the time of a crossing: more than a number has digits
 
@@ -406,6 +407,7 @@ class SeenTrend:
 
     since: float
     until: float
+    estimates: int = 1  # That showed it
 
     def is_over(self, now: float) -> bool:
         """Whether it was not seen for so long that its event ends."""
@@ -413,7 +415,7 @@ class SeenTrend:
 
     def is_lasting(self, now: float, length: float) -> bool:
         """Whether it is seen ``now``, and has been for long enough, in a history of ``length`` s."""
-        return self.until == now and now - self.since >= _hold(length)
+        return self.until == now and now - self.since >= _hold(length) and self.estimates >= MIN_SEEN
 
 
 def _hold(length: float) -> float:
@@ -428,11 +430,17 @@ def seen_trend(
     before: SeenTrend | None,
     now: float,
 ) -> SeenTrend | None:
-    """Return when the trend of a history was seen, up to ``now``; None if it never was."""
+    """Return when the trend of a history was seen, up to ``now``; None if it never was.
+
+    It goes on where estimates have not shown it for a short time only. A time without estimates does not count.
+    """
     if (crossing := next_crossing(forecast, now)) is None or not _is_new(quantity, history, crossing.limit):
         return before
-    goes_on = before is not None and 0.0 <= now - before.until < _hold(span(history))
-    return SeenTrend(before.since if before is not None and goes_on else now, now)
+    if before is None or not before.until <= now:
+        return SeenTrend(now, now)
+    unseen = next((time for time, _, _ in history if time > before.until), now)
+    goes_on = now - unseen < _hold(span(history))
+    return SeenTrend(before.since, now, before.estimates + 1) if goes_on else SeenTrend(now, now)
 
 
 def next_crossing(forecast: ForecastDocument | None, now: float) -> CrossingDocument | None:
