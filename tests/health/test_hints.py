@@ -86,6 +86,21 @@ def test_what_begins_after_the_signals_agreed_for_long_is_a_change(kind: Finding
     assert assessed([*agreeing(KNOWN_WINDOWS), *only_file])[-1].hints
 
 
+def test_parameters_that_are_never_determined_at_once_do_not_keep_a_change_a_hint() -> None:
+    def one_of_two(index: int) -> ReportDocument:
+        (window,) = agreeing(1, index)
+        own = window.parameters["R_a"]
+        held = own.model_copy(update={"status": Status.HELD})
+        both = {"R_a": own, "J": held} if index % 5 else {"R_a": held, "J": own}
+        return window.model_copy(update={"parameters": both})
+
+    rare = 5 * KNOWN_WINDOWS - 4  # windows in which J is determined for the last time that is needed
+    early = [*map(one_of_two, range(rare - 1)), *with_finding(late(LENGTH * (rare - 1)), rare - 1)]
+    assert assessed(early)[-1].hints
+    last = assessed([*map(one_of_two, range(rare)), *with_finding(late(LENGTH * rare), rare)])[-1]
+    assert [(event.part, event.state) for event in last.open_events] == [("bus", Level.WATCH)]
+
+
 def test_windows_that_may_hide_a_delay_do_not_show_that_there_was_none() -> None:
     """At a constant speed no parameter of the dynamics is determined, and no delay is seen."""
     still = agreeing(2 * KNOWN_WINDOWS, status=Status.HELD)

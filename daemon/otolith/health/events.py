@@ -104,7 +104,8 @@ class HealthState:
     inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
     doubtful: tuple[int, ...] = ()  # Indices of those of the last windows that contradicted what was known
     agreed: int = -1  # Index of the last window that agreed with it
-    as_stated: int = 0  # Windows in which the signals determined every parameter and were as the machine file says
+    as_stated: Mapping[str, int] = field(default_factory=dict)
+    """Windows in which the signals determined each parameter and were as the machine file says."""
     known_since: float | None = None
     """Service time, s, at which these were enough: what begins later is a change. None before."""
     document: HealthDocument | None = None  # The states in the report before
@@ -143,7 +144,7 @@ class HealthState:
     def without_hints(self, reason: str) -> "HealthState":
         """Return the state for another machine file, of which nothing is known to be wrong."""
         keys = [key for key, record in self.records.items() if record.event is not None and record.event.is_hint]
-        return replace(self.without_events(keys, reason), as_stated=0, known_since=None)
+        return replace(self.without_events(keys, reason), as_stated={}, known_since=None)
 
     def agreeing(self, published: Mapping[str, EventDocument], reason: str) -> "HealthState":
         """Return the state with no other open events than were ``published``, by id the last change of each.
@@ -274,14 +275,16 @@ def _with_doubts(state: HealthState, report: ReportDocument) -> HealthState:
 def _with_agreement(state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with whether the signals have been as the machine file says for long enough to know that.
 
-    A window that does not determine every parameter may hide a delay, as one at a constant speed does.
+    A window that does not determine a parameter may hide a delay, as one at a constant speed does. Not all parameters
+    need to be determined at once.
     """
     is_as_stated = report.decision is WindowDecision.LEARNED and report.fit is not None and report.fit.explained
-    is_rich = all(item.status is Status.ESTIMATED for item in report.parameters.values())
-    if state.known_since is not None or not is_as_stated or not is_rich:
+    if state.known_since is not None or not is_as_stated:
         return state
-    count = state.as_stated + 1
-    return replace(state, as_stated=count, known_since=report.window.end if count >= KNOWN_WINDOWS else None)
+    shown = {name for name, item in report.parameters.items() if item.status is Status.ESTIMATED}
+    counts = {name: state.as_stated.get(name, 0) + (name in shown) for name in report.parameters}
+    is_known = min(counts.values(), default=KNOWN_WINDOWS) >= KNOWN_WINDOWS
+    return replace(state, as_stated=counts, known_since=report.window.end if is_known else None)
 
 
 def _from_start(observed: Observation) -> Observation:

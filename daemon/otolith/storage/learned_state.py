@@ -107,6 +107,15 @@ class LearnedState(StrictModel):
 
     @model_validator(mode="before")
     @classmethod
+    def _without_counts(cls, content: Any) -> Any:
+        """Leave out the one count of windows as stated that older files have for all parameters together."""
+        health = content.get("health") if isinstance(content, dict) else None
+        if not isinstance(health, dict) or not isinstance(health.get("as_stated"), int):
+            return content
+        return {**content, "health": {key: item for key, item in health.items() if key != "as_stated"}}
+
+    @model_validator(mode="before")
+    @classmethod
     def _join_histories(cls, content: Any) -> Any:
         """Join the histories that older files kept apart from before their clock was set back."""
         health = content.get("health") if isinstance(content, dict) else None
