@@ -211,7 +211,8 @@ def test_a_wrong_argument_is_named(begin: Begin) -> None:
     with raises_saying(ConfigurationError, "limit/R_a@", "not shelved"):
         person.asks("unshelve", "limit/R_a")
     for arguments, parts in (
-        (("shelve", "limit/R_a", "--for", "8d", "--reason", "x"), ("8d", "7d")),
+        (("shelve", "limit/R_a", "--for", "8d", "--reason", "x"), ("8d", "1s", "7d")),
+        (("shelve", "limit/R_a", "--for", "0.0000001s", "--reason", "x"), ("0.0000001s", "1s", "7d")),
         (("shelve", "limit/R_a", "--for", "1h", "--reason", " "), ("empty",)),
         (("comment", "limit/R_a", "x" * (MAX_NOTE + 1)), (f"{MAX_NOTE + 1}", f"{MAX_NOTE}")),
     ):

@@ -19,7 +19,7 @@ from otolith_drivers.config_files import DocumentModel
 MAX_COMMENTS = 20  # of an event that its document has; the history has all
 MAX_NOTE = 500  # characters of a reason or comment
 MAX_NAME = 100  # characters of a person's name
-MAX_SHELF = 7 * 86_400.0  # s for which a condition may be shelved at once
+MIN_SHELF, MAX_SHELF = 1.0, 7 * 86_400.0  # s for which a condition may be shelved at once
 
 
 class Deed(StrEnum):

@@ -60,11 +60,12 @@ def _text(_: click.Context, parameter: click.Parameter, text: str | None) -> str
 
 
 def _length(_: click.Context, __: click.Parameter, text: str) -> float:
-    from otolith.health.notes import MAX_SHELF
+    from otolith.health.notes import MAX_SHELF, MIN_SHELF
 
     match = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip())
-    if match is None or not 0.0 < float(match[1]) * SPANS[match[2]] <= MAX_SHELF:
-        raise click.BadParameter(f"{text!r}: write a time up to {MAX_SHELF / SPANS['d']:.0f}d, like 30m, 8h or 3d")
+    if match is None or not MIN_SHELF <= float(match[1]) * SPANS[match[2]] <= MAX_SHELF:
+        bounds = f"{MIN_SHELF:.0f}s to {MAX_SHELF / SPANS['d']:.0f}d"
+        raise click.BadParameter(f"{text!r}: write a time of {bounds}, like 30m, 8h or 3d")
     return float(match[1]) * SPANS[match[2]]
 
 
