@@ -1,5 +1,6 @@
 """A certificate is replaced by another for the same name while readers are connected, without a restart."""
 
+import json
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -24,8 +25,9 @@ from otolith.publishing.certificates import (
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access, Credentials
 from otolith_drivers.errors import ConfigurationError
+from tests.cli.commands import otolith
 from tests.conftest import free_port
-from tests.messages import assert_says, raises_saying
+from tests.messages import assert_each_says, assert_says, raises_saying
 from tests.publishing.test_security import EXPECTED, Reader
 from tests.runtime.test_clock import Computer, Start, daemons
 from tests.waiting import wait_for
@@ -137,11 +139,26 @@ def test_renewing_keeps_hosts_and_the_old_files(site: Path) -> None:
     assert (kept.read_bytes(), kept.with_suffix(".key").read_bytes()) == old
     assert f"{kept}: the old certificate, stays valid until {end:%F}" in done.output
     assert (site / "press.key").stat().st_mode & 0o777 == 0o600
-    hosts = {path.name: hosts for path, (_, hosts) in certificates.issued(site).items()}
+    hosts = {path.name: hosts for path, (_, hosts) in certificates.issued(site)[0].items()}
     assert hosts["press.crt"] == hosts[kept.name] == ("127.0.0.1", "localhost")
     listed = keys("list", site).output.splitlines()
     assert [line.split()[0] for line in listed] == ["ca", "operator", "press", kept.stem]
     assert "days left" in listed[1]
+
+
+def test_a_file_that_is_no_certificate_hides_no_other(site: Path) -> None:
+    (site / "junk.crt").write_text("not a certificate")
+    (site / "folder.crt").mkdir()
+    (site / "ca.crt").write_bytes(b"")
+    done = otolith("keys", "list", site)
+    assert done.return_value == 1
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["operator", "press"]
+    told = done.stderr.splitlines()
+    assert len(told) == 3
+    assert_each_says(told, ["ca.crt"], ["folder.crt"], ["junk.crt", "certificate"])
+    document = json.loads(keys("list", site, "--json").stdout)
+    assert [Path(row["file"]).stem for row in document["certificates"]] == ["operator", "press"]
+    assert [Path(row["file"]).stem for row in document["unreadable"]] == ["ca", "folder", "junk"]
 
 
 def test_a_second_renewal_on_a_day_loses_nothing(site: Path) -> None:

@@ -189,11 +189,21 @@ def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: dateti
     return Renewal(stem.with_name(f"{stem.name}.crt"), end, certificate.not_valid_after_utc)
 
 
-def issued(folder: Path) -> dict[Path, tuple[datetime, tuple[str, ...]]]:
-    """Return the end and the hosts of each certificate in ``folder``, by its path; the authority is the first."""
-    paths = sorted(folder.glob("*.crt"), key=lambda path: (path.stem != "ca", path.name))
-    first = {path: authorities(path, ())[0] for path in paths}
-    return {path: (own.not_valid_after_utc, tuple(sorted(_names(own)))) for path, own in first.items()}
+def issued(folder: Path) -> tuple[dict[Path, tuple[datetime, tuple[str, ...]]], dict[Path, str]]:
+    """Return end and hosts of each certificate in ``folder``, by its path, and why other files of that kind are none.
+
+    The authority is the first.
+    """
+    rows, faults = dict[Path, tuple[datetime, tuple[str, ...]]](), dict[Path, str]()
+    for path in sorted(folder.glob("*.crt"), key=lambda path: (path.stem != "ca", path.name)):
+        try:
+            own = authorities(path, ())[0]
+            rows[path] = own.not_valid_after_utc, tuple(sorted(_names(own)))
+        except ConfigurationError as error:
+            faults[path] = str(error)
+        except (ValueError, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as error:  # of its extensions
+            faults[path] = f"{path}: its names cannot be read: {error}"
+    return rows, faults
 
 
 def _issue(

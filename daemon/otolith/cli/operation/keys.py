@@ -115,24 +115,30 @@ def renew(folder: Path, name: str, hosts: tuple[str, ...]) -> int:
 def list_(folder: Path, as_json: bool) -> int:
     """List the certificates in DIR, and until when they are valid.
 
+    The exit code is 1 if a file *.crt cannot be read.
+
     \b
     Examples:
       otolith keys list keys
     """
     from otolith.publishing.certificates import issued, utc_now
 
-    rows = issued(folder)
+    rows, faults = issued(folder)
+    code = 1 if faults else 0
     if as_json:
         documents = [{"file": str(path), "expires": f"{end:%FT%TZ}", "hosts": hosts}
                      for path, (end, hosts) in rows.items()]  # fmt: skip
-        echo_json({"certificates": documents})
-        return 0
+        unreadable = [{"file": str(path), "reason": reason} for path, reason in faults.items()]
+        echo_json({"certificates": documents, "unreadable": unreadable})
+        return code
     width = max((len(path.stem) for path in rows), default=0)
     for path, (end, hosts) in rows.items():
         left = (end - utc_now()).days
         rest = f"{counted(left, 'day')} left" if left >= 0 else "expired"
         use = "authority" if path.stem == "ca" else ", ".join(hosts) or "reader"
         echo(f"{path.stem:<{width}}  {end:%F}  {rest:>14}  {use}")
-    if not rows:
+    for reason in faults.values():
+        echo(reason, err=True)
+    if not rows and not faults:
         echo(f"{folder}: no certificate; 'otolith keys init {folder}' makes an authority", err=True)
-    return 0
+    return code
