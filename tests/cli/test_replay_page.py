@@ -58,6 +58,15 @@ def test_a_log_without_a_time_of_day_says_so_and_names_no_year(tmp_path: Path, r
     assert not re.search(r"\d{4}-\d\d-\d\d|\d\d:\d\d", text)
 
 
+def test_the_page_has_the_values_that_the_machine_file_gives(tmp_path: Path, rows: Lines) -> None:
+    text = MACHINE.read_text(encoding="utf-8")
+    machine, page = tmp_path / "own.toml", tmp_path / "own.html"
+    machine.write_text(text.replace("[noise]", 'J = "12.5 kg*cm^2"\n\n[noise]'), encoding="utf-8")
+    assert run("replay", machine, written(tmp_path, rows), "--report", page).exception is None
+    assert "0.00125 kg" in text_of(page)
+    assert "0.001171" not in text_of(page)
+
+
 def test_two_replays_draw_the_same_bytes(tmp_path: Path, rows: Lines) -> None:
     data, pages = written(tmp_path, dated(rows)), [tmp_path / "1.html", tmp_path / "2.html"]
     for page in pages:

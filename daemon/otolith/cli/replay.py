@@ -190,7 +190,7 @@ def _history(
     ):
         yield history.add
         log = {"files": [path.name for path in data], "warnings": run.warnings()}
-        history.describe(describe_machine(machine.twin, run.state.plan, log))
+        history.describe(describe_machine(machine.twin, run.state.plan, log, given=dict(machine.problem.known)))
         if page is not None and history.span is not None:
             write_page(page, page_of(history.reader, *history.span))
 

@@ -460,7 +460,8 @@ class Service:
         """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
         plan = self._supervisor.state.plan
         if self._history is not None and plan != self._described:
-            text = describe_machine(self._machine.twin, plan, file=self._machine.path)
+            machine = self._machine
+            text = describe_machine(machine.twin, plan, None, machine.path, dict(machine.problem.known))
             self._history.description, self._described = text, plan
 
     def _counters(self) -> CountersDocument:

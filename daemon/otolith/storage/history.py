@@ -106,15 +106,21 @@ def path_in(folder: Path, site: str, machine: str) -> Path:
 
 
 def describe_machine(
-    twin: Definition, plan: MonitoringPlan, log: Mapping[str, Any] | None = None, file: Path | None = None
+    twin: Definition,
+    plan: MonitoringPlan,
+    log: Mapping[str, Any] | None = None,
+    file: Path | None = None,
+    given: Mapping[str, float] | None = None,
 ) -> str:
     """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter.
 
     ``log`` tells of the data that were replayed: ``files``, their names, and ``warnings``, what a reader must know.
+    ``given`` has the parameters that the machine file gives; the others have the values of the twin's example.
     ``file`` is the machine file, by which commands find it that are given the name of the machine.
     """
     sides = [(name, text) for name, text, _ in twin.definitions]
-    values = {row.name: (row.nominal, row.unit, row.meaning) for row in twin.parameters if row.role is not Role.SETTING}
+    rows, stated = [row for row in twin.parameters if row.role is not Role.SETTING], given or {}
+    values = {row.name: (stated.get(row.name, row.nominal), row.unit, row.meaning) for row in rows}
     limits = {name: [(row.level, row.value, row.is_lower) for row in quantity.limits]
               for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
     sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}

@@ -52,11 +52,15 @@ DBC_WITHOUT_NODE = re.compile(
 )
 EXTENDED_FLAG = 1 << 31  # of an identifier in a DBC
 # What else says how a message is read: types, multiplexers, values that are no readings, its protocol and its period.
-DBC_REST = r'\s(?:[^;"]|"[^"]*+")*+(?:;|\Z|")'  # one without an end is read once, not from each place
+# A statement ends with a semicolon, or incomplete where the next line begins another one.
+DBC_REST = r'\s(?:[^;"\n]|"[^"\n]*+"|\n(?![ \t]*[A-Z][A-Z_]*_\b))*+;?'
 DBC_ATTRIBUTE = r'"(?:VFrameFormat|GenMsgCycleTime)"'
-DBC_EXTRA = re.compile(rf"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+){DBC_REST}", re.MULTILINE)
+DBC_TYPES = re.compile(rf"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+){DBC_REST}", re.MULTILINE)
 DBC_VALUES = re.compile(rf"^[ \t]*(?:VAL_|BA_\s+{DBC_ATTRIBUTE}\s+BO_)\s+(\d+){DBC_REST}", re.MULTILINE)
-DBC_DEFINITION = re.compile(rf"^[ \t]*BA_DEF_(?:DEF_)?\s+(?:BO_\s+)?{DBC_ATTRIBUTE}{DBC_REST}", re.MULTILINE)
+DBC_DEFINITION = re.compile(rf"^[ \t]*(BA_DEF_(?:DEF_)?\s+(?:BO_\s+)?{DBC_ATTRIBUTE}){DBC_REST}", re.MULTILINE)
+DBC_SIGNAL = re.compile(r'^[ \t]*SG_ [^"\n]*"[^"\n]*"', re.MULTILINE)  # as far as its unit
+DBC_STATEMENT = re.compile(r"\s*(?:VAL_|BA_|CM_|SIG_|SG_MUL_VAL_|BO_TX_BU_|EV_)")  # that a semicolon ends
+MAX_TABLES = 100  # of a message that are tried alone: engineering choice, bounds the time
 
 logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings become faults here
 
@@ -114,6 +118,8 @@ def load_database(path: Path) -> CanDatabase:
         multiplexed = _multiplexed_places(text)
     unread: dict[str, str] = {}
     try:
+        if is_dbc and (end := _end_of(text)):
+            raise ValueError(end)  # noqa: TRY301 - as what the parser finds
         parsed = _parse(text, kind)
     except Exception as error:  # parsers raise exceptions of many types
         parsed, unread, lost = _parse_each_message(text) if is_dbc else ([], {}, [])
@@ -217,31 +223,57 @@ def _parse(text: str, kind: str | None) -> list[Message]:
     return database.messages
 
 
+def _end_of(text: str) -> str:
+    """The incomplete statement at the end of a DBC, which cantools leaves out silently; empty if there is none."""
+    last = text.rstrip().rpartition("\n")[2]
+    is_cut = DBC_STATEMENT.match(last) and not last.endswith(";")
+    is_cut = is_cut or (last.lstrip().startswith("SG_ ") and not DBC_SIGNAL.match(last))
+    return f"the file ends within {last.strip()[:40]!r}" if is_cut else ""
+
+
 def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str], list[DatabaseFault]]:
     """The messages of a DBC that can be parsed alone, why each of the others cannot, and what is lost of the former."""
-    types, values = _by_message(DBC_EXTRA, text), _by_message(DBC_VALUES, text)
-    definitions = [match[0] for match in DBC_DEFINITION.finditer(text) if match[0].endswith(";")]
+    types, values = _by_message(DBC_TYPES, text), _by_message(DBC_VALUES, text)
+    definitions = list({match[1]: match[0] for match in DBC_DEFINITION.finditer(text) if match[0][-1] == ";"}.values())
     read: list[Message] = []
     unread: dict[str, str] = {}
     faults: list[DatabaseFault] = []
     for identifier, name, block in _dbc_messages(text):
-        with_types, beside = [block, *types.pop(identifier, ())], values.pop(identifier, [])
-        parsed, why = _parse_alone([*definitions, *with_types, *beside])
-        if not parsed and beside:
-            parsed, _ = _parse_alone(with_types)
-            text_of_fault = f"values of {name} that are no readings are not known: its tables cannot be read: {why}"
-            faults += [DatabaseFault(text_of_fault, name)] if parsed else []
+        whole = [block, *types.pop(identifier, ())]
+        if why := _incomplete(whole):
+            unread[name] = why
+            continue
+        beside = values.pop(identifier, [])
+        taken = [row for row in beside if row.endswith(";")]
+        parsed, why = _parse_alone([*definitions, *whole, *taken])
+        if not parsed and taken:
+            taken = [row for row in taken[:MAX_TABLES] if _parse_alone([*definitions, *whole, row])[0]]
+            parsed, _ = _parse_alone([*definitions, *whole, *taken])
+            parsed = parsed or _parse_alone(whole)[0]
         read += parsed
         if not parsed:
             unread[name] = why
+        elif len(taken) < len(beside):
+            lost = next(row for row in beside if row not in taken).strip()[:40]
+            faults.append(
+                DatabaseFault(f"values of {name} that are no readings are not known: {lost!r} is broken", name)
+            )
     return read, unread, faults
 
 
+def _incomplete(statements: list[str]) -> str:
+    """What of a message and its types is cut off; empty if nothing is."""
+    block, *types = statements
+    if block.count("SG_ ") > len(DBC_SIGNAL.findall(block)):
+        return "one of its signals is cut off"
+    return next((f"{row.strip()[:40]!r} is cut off" for row in types if not row.endswith(";")), "")
+
+
 def _by_message(pattern: re.Pattern[str], text: str) -> dict[str, list[str]]:
-    """The complete statements of a DBC that ``pattern`` finds, by the identifier of their message."""
+    """The statements of a DBC that ``pattern`` finds, also incomplete ones, by the identifier of their message."""
     statements: dict[str, list[str]] = defaultdict(list)
     for match in pattern.finditer(text):
-        statements[match[1]] += [match[0]] if match[0].endswith(";") else []
+        statements[match[1]].append(match[0])
     return statements
 
 

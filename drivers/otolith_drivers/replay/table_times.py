@@ -60,14 +60,20 @@ def date_of(text: str, zone: tzinfo) -> float:
     return math.inf
 
 
-def since_1970(times: Array, scale: float) -> Array:
-    """Return ``times`` (n,) in s with those of a spreadsheet, in a unit of ``scale`` s, counted from 1970."""
-    if scale != DAY or not len(times):
+def since_1970(times: Array, scale: float, zone: tzinfo) -> Array:
+    """Return ``times`` (n,) in s with those of a spreadsheet, in a unit of ``scale`` s, counted from 1970.
+
+    A spreadsheet shows the time of a day in the ``zone`` of the plant.
+    """
+    if scale != DAY:
         return times
     low, high = (DAY * days for days in SPREADSHEET_DAYS)
-    finite = times[np.isfinite(times)]
-    is_counted = bool(len(finite)) and low <= float(finite.min()) and float(finite.max()) <= high
-    return times - DAY * DAYS_TO_1970 if is_counted else times
+    counted = np.flatnonzero((times >= low) & (times <= high))
+    moved = times.copy()
+    for row in counted:
+        local = datetime.fromtimestamp(float(times[row]) - DAY * DAYS_TO_1970, UTC).replace(tzinfo=None)
+        moved[row] = unix_time(local, zone)
+    return moved
 
 
 def question_of_unit(times: Array) -> str:

@@ -306,7 +306,8 @@ class _TableChunk:
             cause = f"{shown(cell)} may be {whole} or a number with decimals, as no other cell shows it"
             raise ConfigurationError(f"{self._header.path}: {cause}: export without separated thousands")
         counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
-        times = since_1970(columns[TIME].scaled(_numbers(texts[TIME], counts.decimal)), columns[TIME].scale)
+        numbers = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
+        times = since_1970(numbers, columns[TIME].scale, self._zone)
         dates = np.flatnonzero(np.isinf(times))
         times[dates] = [date_of(text, self._zone) for text in texts[TIME].take(pa.array(dates)).to_pylist()]
         own = [column.place for column in columns.values()] if self._header.is_shared else None

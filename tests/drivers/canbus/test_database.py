@@ -216,6 +216,41 @@ def test_a_fault_of_an_unused_line_leaves_values_that_are_no_readings(tmp_path: 
         assert any("Motor" in line and "no readings" in line for line in database.warnings())
 
 
+OTHER = 'BO_ 641 Heat: 8 Drive\n SG_ Winding : 0|32@1+ (1,0) [0|0] "degC" Monitor'
+
+
+@pytest.mark.parametrize(
+    ("broken", "named", "is_float"),
+    [
+        ('VAL_ 385 Speed 65535 "SNA ;\nVAL_ 641 Winding 255 "SNA" ;', "Motor", False),
+        ("SIG_VALTYPE_ 385 Speed : 1\nSIG_VALTYPE_ 641 Winding : 1;", "Motor", True),
+        ('CM_ "never closed\nVAL_ 641 Winding 255 "SNA" ;', "only its messages", False),
+    ],
+)
+def test_a_broken_statement_costs_no_other_message(tmp_path: Path, broken: str, named: str, is_float: bool) -> None:
+    database = loaded(tmp_path / "drive.dbc", dbc(MOTOR, OTHER, after=broken))
+    (heat,) = (message for message in database.messages if message.name == "Heat")
+    conversion = heat.signals[0].conversion
+    assert conversion.is_float is is_float
+    assert is_float or dict(conversion.choices or {}) == {255: "SNA"}
+    assert any(named in line for line in database.warnings()) or named in database.unread
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        'VAL_ 641 Winding 255 "SNA"',
+        "SIG_VALTYPE_ 641 Winding : 1",
+        "BO_ 642 Cut: 8 Drive\n SG_ Q : 0|16@1+ (0.01,0) [-3",
+    ],
+)
+def test_a_file_that_ends_within_a_statement_says_so(tmp_path: Path, end: str) -> None:
+    database = loaded(tmp_path / "drive.dbc", dbc(MOTOR, OTHER).rstrip() + "\n" + end)
+    assert any("ends within" in line for line in database.warnings())
+    assert any(name in " ".join(database.warnings()) for name in ("Heat", "Cut"))
+    assert {message.name for message in database.messages} >= {"Motor"}
+
+
 def test_an_unreadable_message_does_not_affect_others(tmp_path: Path) -> None:
     text = dbc('BO_ 642 Sick: 8 Drive\n SG_ One : 0|zero@1+ (1,0) [0|0] "V" Monitor', MOTOR)
     frame_decoder = decoder(tmp_path, SPEED, text)

@@ -29,8 +29,6 @@ READ = {
     "signals that overlap": message(*(signal(f"s{number}") for number in range(1500))),
     "a long frame": message(*(signal(f"s{n}", f"{8 * n}|8") for n in range(2000)), length=4096),
     "multiplexed signals": muxed(3000),
-    "extended multiplexers without an end": message(signal("s")) + "SG_MUL_VAL_ 1 \n" * 250_000,
-    "types without an end": message(signal("s")) + "SIG_VALTYPE_ 1 \n" * 200_000,
     "blank lines": message(signal("s")) + "\n" * 3_000_000,
     "lines of spaces": message(signal("s")) + " \n" * 1_500_000,
 }
@@ -38,6 +36,11 @@ REFUSED = {
     "more signals in a message": (muxed(5000), "signals"),
     "ranges of multiplexers": (
         muxed(50) + "".join(f"SG_MUL_VAL_ 1 s{number % 50} x 0-65000;\n" for number in range(2000)), "values",
+    ),
+    "extended multiplexers without an end": (message(signal("s")) + "SG_MUL_VAL_ 1 \n" * 250_000, "ends within"),
+    "types without an end": (message(signal("s")) + "SIG_VALTYPE_ 1 \n" * 200_000, "ends within"),
+    "types without an end before a value": (
+        message(signal("s")) + "SIG_VALTYPE_ 1 \n" * 200_000 + 'VAL_ 1 s 1 "on" ;\n', "not a CAN database",
     ),
     "incomplete messages": (HEAD + "BO_ \n" * 500_000, str(MAX_MESSAGES)),
 }  # fmt: skip

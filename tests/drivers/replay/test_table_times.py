@@ -129,6 +129,15 @@ def test_rows_faster_than_any_logger_are_asked_about(
         assert since[0] == pytest.approx(1_696_439_441.0, abs=1.0)
 
 
+def test_days_of_a_spreadsheet_are_in_the_zone_of_the_plant_whatever_stands_beside_them(tmp_path: Path) -> None:
+    path = table(tmp_path, "t [d];x", ["0;0", "46110,5;1", "46110,75;2"])
+    signals = (Signal(name="x", unit="1", source=TableSource()),)
+    with open_log(path, Setup(signals, tmp_path, 0.01, timezone="Europe/Berlin")) as reader:
+        times = np.concatenate([rows.times for rows in reader.chunks()])
+    noon = 1_774_778_400.0  # 2026-03-29 12:00 in Berlin
+    assert times.tolist() == pytest.approx([0.0, noon, noon + 21_600.0])
+
+
 def test_a_fast_table_whose_unit_is_stated_is_not_asked_about(tmp_path: Path) -> None:
     path = table(tmp_path, "t [s];x", [f"{row * 1e-8:.10f};{row}" for row in range(20)])
     assert samples(path, x={})["x"][19][0] == pytest.approx(1.9e-7)
