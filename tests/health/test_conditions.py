@@ -97,6 +97,14 @@ def test_rules_of_a_machine_file_are_explained_in_terminal_and_page() -> None:
     assert "worn-seal <b>" not in page
 
 
+def test_text_of_a_rule_is_no_markdown() -> None:
+    text = r"a <b>x</b> &lt;i> | c\| `d` [e](javascript:f)"
+    rule = OWN.model_copy(update=dict.fromkeys(("id", "condition", "cause", "advice", "source"), text))
+    texts = texts_in("en")
+    written = markdown([condition_page(rule, [rule], texts)], texts)
+    assert written.count(r"a \<b\>x\</b\> \&lt;i\> \| c\\\| \`d\` \[e\](javascript:f)") == 5
+
+
 def test_a_rule_of_any_history_controls_no_terminal_and_makes_no_line() -> None:
     attacks = " ".join(text for text in HOSTILE if len(text) < 100)
     monitored(OWN.model_copy(update=dict.fromkeys(("condition", "cause", "advice"), attacks)))

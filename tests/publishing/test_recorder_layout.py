@@ -25,7 +25,7 @@ def test_the_text_has_state_what_since_when_how_sure_and_what_to_do() -> None:
     assert text.startswith("# ACT\n\n## winding: short circuit between turns of the winding\nsince ")
     assert text.count("ACT") == text.count("since ") == 1
     for part in (
-        "R\\_a is 5.800 ± 0.020 Ω",
+        "R_a is 5.800 ± 0.020 Ω",
         "% probability)",
         "**What to do: plan a replacement of the winding",
     ):
@@ -48,9 +48,9 @@ def test_a_forecast_that_is_not_announced_is_no_matter_of_the_operator() -> None
 
 def test_text_of_a_machine_is_no_markdown() -> None:
     document = at(Level.ACT)
-    event = document.events[0].model_copy(update={"text": "0.005 N*m, [now] 5 N*m | <b>", "advice": "`a`"})
+    event = document.events[0].model_copy(update={"text": "0.005 N*m, [now] 5 N*m | <b> &lt;", "advice": "`a`"})
     text = operator_text(document.model_copy(update={"events": (event,)}))
-    assert r"0.005 N\*m, \[now\] 5 N\*m \| \<b\>" in text
+    assert r"0.005 N\*m, \[now\] 5 N\*m \| \<b\> \&lt;" in text
     assert r"\`a\`**" in text
 
 

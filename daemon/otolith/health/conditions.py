@@ -18,6 +18,7 @@ from otolith.health.observations import (
 )
 from otolith.health.schema import FindingKind
 from otolith.health.text import Texts
+from otolith_drivers.grammars.markdown import markdown_text
 
 MANY = 1000.0  # An order of this or more is no bound: the highest that rules have
 LIMITS = (FindingKind.LIMIT, FindingKind.LIMIT_FROM_START)
@@ -70,14 +71,14 @@ def markdown(pages: Iterable[ConditionPage], texts: Texts) -> str:
     lines = [f"# {own['title']}", "", own["about"], ""]
     for page in pages:
         lines += [f"## {_line(page.id)}", "", f"**{_line(page.condition)}**", "", "| | |", "|---|---|"]
-        lines += [f"| {own[key]} | {_line(text).replace('|', chr(92) + '|')} |" for key, text in page.texts.items()]
+        lines += [f"| {own[key]} | {_line(text)} |" for key, text in page.texts.items()]
         lines.append("")
     return "\n".join(lines)
 
 
 def _line(text: str) -> str:
-    """Return a text of a rule, which may have several lines in a machine file, as one."""
-    return " ".join(text.splitlines())
+    """Return a text of a rule, which may have several lines in a machine file, as one of Markdown."""
+    return markdown_text(" ".join(text.splitlines()))
 
 
 def _key(kind: FindingKind) -> str:

@@ -44,6 +44,7 @@ from otolith.machine import RecordedMachine
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith.twin.definition import Input, Output
 from otolith_drivers import keep_pandas_out
+from otolith_drivers.grammars.markdown import markdown_text
 from otolith_drivers.outside_text import visible
 from otolith_drivers.replay.recording import packed
 from otolith_drivers.units import equation_text, quantity_text, unit_text
@@ -413,10 +414,13 @@ def operator_text(document: ReportDocument) -> str:
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since, health.timezone))}"
         why = health.reason or ("" if undecided else texts("all_well"))
-        lines += [_plain(why)] if why and not current else []
-    lines += [_plain(unknown)] if (unknown := unknown_text(health, current)) else []
+        lines += [markdown_text(why)] if why and not current else []
+    lines += [markdown_text(unknown)] if (unknown := unknown_text(health, current)) else []
     if undecided:
-        lines += [f"**{_plain(undecided)}**", f"**{texts('what_to_do')}: {_plain(texts('undecided_advice'))}**"]
+        lines += [
+            f"**{markdown_text(undecided)}**",
+            f"**{texts('what_to_do')}: {markdown_text(texts('undecided_advice'))}**",
+        ]
     lines += [_paragraph(event, health.state) for event in current]
     return texts.decimals("\n\n".join(lines))
 
@@ -427,16 +431,11 @@ def _paragraph(event: EventDocument, worst: Level) -> str:
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     state = "" if event.state is worst else f"{say.translated(event.state)}: "
     written = in_local_time(event.text, event.timezone)
-    what = _plain(f"{state}{say.part(event.part)}: {event.condition}")
+    what = markdown_text(f"{state}{say.part(event.part)}: {event.condition}")
     what = f"## {what}\n{say('since', time=moment_text(event.since, event.timezone))}"
-    advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
-    notes = map(_plain, note_texts(event, clock_in(event.timezone)))
-    return "  \n".join(filter(None, [what, advice, _plain(f"{written}{sure}"), *notes]))
-
-
-def _plain(text: str) -> str:
-    """Return text that is not Markdown, as ``N*m`` would be, in Markdown: one line, also in a table."""
-    return re.sub(r"([\\`*_<>#|\[\]!])", r"\\\1", visible(text))
+    advice = f"**{say('what_to_do')}: {markdown_text(event.advice)}**" if event.advice else ""
+    notes = map(markdown_text, note_texts(event, clock_in(event.timezone)))
+    return "  \n".join(filter(None, [what, advice, markdown_text(f"{written}{sure}"), *notes]))
 
 
 def report_text(document: ReportDocument) -> str:
@@ -444,22 +443,23 @@ def report_text(document: ReportDocument) -> str:
     texts = texts_in("en" if document.health is None else document.health.language)
     rows = [f"# {document.machine}, {document.site}", ""]
     current = document.open_events
-    rows += [] if document.health is None else [_plain(headline(document.health, events=current)), ""]
+    rows += [] if document.health is None else [markdown_text(headline(document.health, events=current)), ""]
     say, columns = texts.translated, "| {} | {} | {} |\n|---|---|---|"
     rows += [columns.format(say("parameter"), say("value"), say("status"))]
     parameters = document.parameters.items()
     rows += [
-        f"| {_plain(name)} | {_plain(say(value_text(row)))} | {_plain(f'{say(row.status)} {row.reason}')} |"
+        f"| {markdown_text(name)} | {markdown_text(say(value_text(row)))} | "
+        f"{markdown_text(f'{say(row.status)} {row.reason}')} |"
         for name, row in parameters
     ]
     if document.components:
         rows += ["", columns.format(say("component"), say("equation"), say("status"))]
         rows += [
-            f"| {_plain(say(row.meaning))} | {_plain(equation_text(row.equation))} | "
-            f"{_plain(f'{say(row.status)}, {approval_text(row, texts)}')} |"
+            f"| {markdown_text(say(row.meaning))} | {markdown_text(equation_text(row.equation))} | "
+            f"{markdown_text(f'{say(row.status)}, {approval_text(row, texts)}')} |"
             for row in document.components
         ]
-    rows += [f"\n{_plain(event_text(event, details=True))}" for event in (*current, *document.hints)]
+    rows += [f"\n{markdown_text(event_text(event, details=True))}" for event in (*current, *document.hints)]
     return texts.decimals("\n".join(rows))
 
 
