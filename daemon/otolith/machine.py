@@ -14,7 +14,7 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.health.diagnosis import MonitoringPlan, Rule, RulesFile, worded
+from otolith.health.diagnosis import LIMITS, MonitoringPlan, Rule, RulesFile, worded
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity
 from otolith.health.schema import Language
 from otolith.health.text import texts_in
@@ -389,12 +389,18 @@ def _with_temperature(
 
 
 def _check_rules(file: MachineFile, twin: Definition, context: Context) -> None:
-    """Raise ConfigurationError if a rule of the file names what this machine does not have."""
+    """Raise ConfigurationError if a rule has the id of another, no effect, or names what this machine does not have."""
     subjects = [row.name for row in twin.parameters] + [row.name for row in twin.sites] + [*signal_units(file, twin)]
     subjects += [str(table.get("name", table.get("type"))) for table in file.drivers]
     inputs = [source.name.partition("(")[0] for source in sources(twin) if source.name]
     known = {"twin": [twin.name], "subject": subjects, "family": list(FAMILY_NAMES), "input": inputs}
+    ids = [rule.id for rule in file.rule]
     for number, rule in enumerate(file.rule):
+        if (first := ids.index(rule.id)) < number:
+            context.fail(("rule", number, "id"), f"{rule.id!r} is the id of rule[{first}] too: write another")
+        if rule.severity == "HINT" and rule.finding in LIMITS:
+            fault = f"'HINT' is no level of {rule.finding.value!r}, whose limits give WATCH or ACT: leave severity out"
+            context.fail(("rule", number, "severity"), fault)
         for key, names in known.items():
             for name in [name for name in getattr(rule, key) if name not in names][:1]:
                 context.fail(("rule", number, key), f"unknown name {name!r}: {nearest(name, names)}")

@@ -57,6 +57,12 @@ def test_advice_to_stop_and_the_answer_to_it_agree() -> None:
         assert not says_soon or rule.stop == "soon", rule.id
 
 
+def test_a_hint_that_a_limit_may_raise_says_what_to_do_then() -> None:
+    texts = texts_in("en")
+    rule = OWN.model_copy(update={"finding": FindingKind.COMPONENT, "severity": "HINT", "stop": ""})
+    assert condition_page(rule, [rule], texts).texts["stop"] == texts.conditions["stop_state"]
+
+
 def test_an_event_of_several_conditions_has_the_page_of_each() -> None:
     rules, texts = (OWN, *load_rules()), texts_in("en")
     pages = pages_of(["winding-hot winding-contact", OWN.id, "winding-hot", "gone"], rules, texts)

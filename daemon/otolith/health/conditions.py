@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from otolith.discovery.decision import COMPONENT_WINDOWS
-from otolith.health.diagnosis import KEYS, Rule
+from otolith.health.diagnosis import KEYS, LIMITS, Rule
 from otolith.health.limits import Level
 from otolith.health.observations import (
     INTERMITTENT_WINDOWS,
@@ -21,7 +21,6 @@ from otolith.health.text import Texts
 from otolith_drivers.grammars.markdown import markdown_text
 
 MANY = 1000.0  # An order of this or more is no bound: the highest that rules have
-LIMITS = (FindingKind.LIMIT, FindingKind.LIMIT_FROM_START)
 OTHERS = {
     **dict.fromkeys((*LIMITS, FindingKind.TREND, FindingKind.MOVED), "other_value"),
     FindingKind.COMPONENT: "other_component",
@@ -43,7 +42,7 @@ class ConditionPage:
 
 def condition_page(rule: Rule, rules: Sequence[Rule], texts: Texts) -> ConditionPage:
     """Return the page of a worded rule among all ``rules`` of the machine, or among the packaged ones."""
-    is_hint = rule.severity == "HINT"
+    is_hint = rule.severity == "HINT" and rule.finding is not FindingKind.COMPONENT  # whose amplitude may have limits
     stop, clears = rule.stop or ("no" if is_hint else "state"), "hint" if is_hint else _key(rule.finding)
     sections = {
         "state": _state(rule, texts),

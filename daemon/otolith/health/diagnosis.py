@@ -6,17 +6,19 @@ most keys, which rest on most evidence. If several remain, the data do not disti
 and none is preferred. The plan of a machine has its rows beside the limits of what is monitored.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import FindingKind, Language
 from otolith.health.text import Texts, texts_in
 from otolith_drivers.config_files import Range, StrictModel
 
+LIMITS = (FindingKind.LIMIT, FindingKind.LIMIT_FROM_START)  # Findings whose level is that of the limit
 KEYS = ("twin", "subject", "side", "manner", "family", "input")
 
 
@@ -52,9 +54,18 @@ class _Row(StrictModel):
     """Whether to stop the machine; ``sensor`` if something that protects uses it, empty for what its state says."""
 
 
+def _own_id(text: str) -> str:
+    """Return the id of a rule, or raise ValueError for one that joined ids, a command line or a link would change."""
+    if not re.fullmatch("[a-z0-9][a-z0-9-]*", text):
+        allowed = "use small letters a-z, digits 0-9 and '-', and begin with a letter or digit"
+        raise ValueError(f"{text!r} is no id of a rule: {allowed}")
+    return text
+
+
 class OwnRule(_Row):
     """A row of a machine file, and what it means."""
 
+    id: Annotated[str, AfterValidator(_own_id)]
     condition: str = Field(min_length=1)
     cause: str = Field(min_length=1)
     advice: str = Field(min_length=1)
