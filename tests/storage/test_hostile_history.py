@@ -103,7 +103,7 @@ def test_a_text_that_unpacks_to_much_is_left_out(path: Path, caplog: pytest.LogC
 
 def test_reports_that_unpack_to_much_together_are_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reader = HistoryReader(path)
-    size = sum(len(report.to_json()) for report in reader.latest(100))
+    size = sum(len(text.encode()) for text in reader.messages("report", 100))
     monkeypatch.setattr(history_safety, "MAX_TEXT_BYTES", size - 1)
     with raises_saying(ConfigurationError, "reports", "MB"):
         reader.latest(100)

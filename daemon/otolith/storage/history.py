@@ -320,11 +320,11 @@ class HistoryReader:
         rows = self._rows(query, labels.first(since))
 
         def parse(first: float, last: float, count: int, text: str) -> dict[str, Any]:
-            FindingDocument.model_validate_json(text)
             document = json.loads(text)
+            whole = FindingDocument.model_validate(document).model_dump(mode="json")  # also what an older version lacks
             times = {"first": first, "last": last, "since": document.get("since", first)}
             times = {name: labels.unix(moment(time)) for name, time in times.items()}
-            return {**document, "count": int(count), **times}
+            return {**whole, **document, "count": int(count), **times}
 
         return self._undamaged(rows, parse)
 
