@@ -16,6 +16,7 @@ from asyncua import Client
 from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.displays import with_displays
 from otolith.cli.commissioning.draft.offers import Offer
+from otolith.cli.commissioning.draft.writing import period_reason, proposed_period
 from otolith.machine import find_twin, load_machine
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
@@ -27,7 +28,7 @@ from tests.drivers.modbus_servers import Words, library_server
 from tests.drivers.mqtt_broker import broker_of_this_process, publisher
 from tests.drivers.opcua_server import opcua_server
 from tests.drivers.registers import registers
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 from tests.waiting import PATIENCE
 
 
@@ -43,6 +44,30 @@ def drive() -> Iterator[int]:
 
     with library_server(moving(), lambda _: moving()) as port:
         yield port
+
+
+def test_the_sample_period_is_that_of_renewals_and_not_of_answers(tmp_path: Path) -> None:
+    """The device answers within a millisecond, and renews its registers every 100 ms."""
+    file, begun = tmp_path / "drive.toml", time.monotonic()
+    told = ["--signal", "V_a=10", "--signal", "i=11", "--signal", "omega=12", "--unit", "10=V", "--unit", "11=mA",
+            "--unit", "12=rpm", "--twin", "dc_motor"]  # fmt: skip
+
+    def renewed() -> Words:
+        return {at: 100 * at + int(10.0 * (time.monotonic() - begun)) for at in (10, 11, 12)}
+
+    with library_server(renewed(), lambda _: renewed()) as port:
+        read = ["--modbus", f"127.0.0.1:{port}", "--registers", "10..12"]
+        shown = otolith("init", file, *read, "--seconds", 1.5, *told).stdout
+        assert tables(file)["window"] == {"length": "20 s", "sample_period": "100 ms"}
+        assert_says(shown, "100 ms", "--sample-period")
+        assert_says(file.read_text(encoding="utf-8"), "registers change")
+
+
+def test_a_sample_period_that_nothing_shows_is_said_to_be_assumed() -> None:
+    still, moving = Offer("10", None, {}, np.zeros(3)), Offer("11", None, {}, np.zeros(3), 0.1)
+    assert (proposed_period([still]), proposed_period([still, moving])) == (0.01, 0.1)
+    assert_says(period_reason([still], "known"), "assumed", "move")
+    assert period_reason([still, moving], "known") == "known"
 
 
 def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tmp_path: Path) -> None:

@@ -11,10 +11,12 @@ chance, and are then wrong by no more than these steps. A single repeated image 
 it is wrong by less than a period, and is accepted.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import cycle
+from statistics import fmean, median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +47,9 @@ SETTLING_READINGS = 200  # two memories, before which the initial value dominate
 COARSE_STEPS = 16  # of a register, up to which it may repeat by chance; test_plausibility: noise of a few steps
 COARSE_SHARE = 0.5  # of changes so small, above which registers are coarse; engineering choice
 MAX_STALE_RUN = 100  # old images in a row; a longer run is a machine at rest (test_plausibility: one that stops)
+MIN_RENEWALS, RENEWALS = 8, 100  # times between renewals of which the usual one is told; of a driver kept
+REST_RATIO = 3.0  # times the median of them, above which the machine was at rest meanwhile
+USUAL_SHARE = 0.15  # by which a period may differ from 1, 2, 5, 10 ... ms, to be that one
 
 Array = NDArray[np.float64]
 
@@ -210,6 +215,20 @@ class OrderMonitor:
         return lines
 
 
+def renewal_period(intervals: Sequence[float]) -> float | None:
+    """Return the time between renewals of registers while the machine moves, rounded; None if there are too few.
+
+    ``intervals`` are the times from change to change as readings show them, so that each is a multiple of theirs.
+    """
+    if len(intervals) < MIN_RENEWALS:
+        return None
+    longest = REST_RATIO * median(intervals)
+    mean = fmean(each for each in intervals if each <= longest)
+    decade = 10.0 ** math.floor(math.log10(mean))
+    usual = min((decade * step for step in (1.0, 2.0, 5.0, 10.0)), key=lambda each: abs(math.log(mean / each)))
+    return float(f"{usual if abs(mean / usual - 1.0) <= USUAL_SHARE else mean:.2g}")
+
+
 @dataclass(slots=True)
 class _Repeats:
     """Running shares of one request; a device may repeat itself until it has shown otherwise."""
@@ -217,6 +236,7 @@ class _Repeats:
     image: Sequence[int] | None = None
     readings: int = 0
     run: int = 0  # Repeated images in a row
+    renewals: deque[int] = field(default_factory=lambda: deque(maxlen=RENEWALS))  # Readings from change to change
     share: float = 1.0  # Share of readings that repeat the previous one
     run_share: float = 1.0  # The same with each run counted once
     coarse_share: float = 1.0  # Share of changes by a few steps only
@@ -234,6 +254,8 @@ class StalenessMonitor:
         previous, state.image = state.image, registers
         repeated = previous == registers
         state.readings += 1
+        if previous is not None and not repeated and state.run <= MAX_STALE_RUN:
+            state.renewals.append(state.run + 1)
         state.run = state.run + 1 if repeated else 0
         stale = 1 < state.run <= MAX_STALE_RUN and state.run_share < RARE_REPEATS and state.coarse_share < COARSE_SHARE
         state.share += SHARE_WEIGHT * (repeated - state.share)
@@ -248,10 +270,18 @@ class StalenessMonitor:
         states = [(request, self._repeats.get(request, _Repeats())) for request in requests]
         return [
             f"{request.describe()} repeat in {state.share:.0%} of the readings: the machine is at rest, or the device "
-            f"renews them more slowly than every {period * 1e3:g} ms"
+            f"renews them {_renewal_text(state.renewals, period)}"
             for request, state in states
             if state.readings >= SETTLING_READINGS and FREQUENT_REPEATS < state.share < 1.0 - SHARE_WEIGHT
         ]
+
+
+def _renewal_text(renewals: Sequence[int], period: float) -> str:
+    """Return how often registers are renewed that are read every ``period`` s, and what to write."""
+    usual = renewal_period([period * each for each in list(renewals)])
+    if usual is None or usual <= period:
+        return f"more slowly than every {period * 1e3:g} ms"
+    return f'about every {usual * 1e3:g} ms: write sample_period = "{usual * 1e3:g} ms"'
 
 
 def _is_near(before: Sequence[int], after: Sequence[int]) -> bool:

@@ -28,6 +28,7 @@ from otolith_drivers.modbus.client import (
     ReadOnlyClient,
 )
 from otolith_drivers.modbus.options import MAX_REGISTERS, LineOptions, Table, TypeName
+from otolith_drivers.modbus.plausibility import renewal_period
 from otolith_drivers.number_inference import (
     REGISTERS,
     Bytes,
@@ -50,6 +51,7 @@ RATES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1)  # usual rates
 MAX_LOAD = 0.9  # share of a period that requests may take at a possible rate
 MAX_SPANS = 8  # ranges of registers that are listed
 Words = NDArray[np.uint16]  # Readings by registers
+Times = NDArray[np.float64]  # s, of the same readings
 Stopped = Callable[[], bool]  # Whether the user has ended the probe
 ProgressCallback = Callable[[str], None]  # Takes a line about what is being done
 # A device that has one byte order for some numbers seldom has another for others. Engineering choices, guarded by
@@ -296,9 +298,10 @@ def spans(addresses: Iterable[int], noun: str = "register") -> str:
 
 def watch(
     client: ProbeClient, blocks: Sequence[Block], seconds: float, stopped: Stopped, progress: ProgressCallback
-) -> dict[Block, Words]:
-    """Read all blocks repeatedly for ``seconds``, at least once; return the readings (rounds by registers)."""
+) -> tuple[dict[Block, Words], dict[Block, Times]]:
+    """Read all blocks repeatedly for ``seconds``, at least once; return readings (rounds by registers) and times."""
     readings: dict[Block, list[list[int]]] = {block: [] for block in blocks}
+    times: dict[Block, list[float]] = {block: [] for block in blocks}
     period = max(MIN_PERIOD, seconds / MAX_READINGS)
     begun = time.monotonic()
     round_due = begun
@@ -307,10 +310,12 @@ def watch(
         for block in blocks:
             with contextlib.suppress(ExceptionReplyError, NoReplyError):  # the survey has read it before
                 readings[block].append(client.read(block.address, block.count))
+                times[block].append(time.monotonic())
         now = time.monotonic()
         round_due = max(round_due + period, now)
         time.sleep(max(0.0, min(round_due, begun + seconds) - now))
-    return {block: np.array(rows, dtype=np.uint16).reshape(-1, block.count) for block, rows in readings.items()}
+    words = {block: np.array(rows, dtype=np.uint16).reshape(-1, block.count) for block, rows in readings.items()}
+    return words, {block: np.array(rows) for block, rows in times.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,6 +391,15 @@ def numbers_of(readings: Mapping[Block, Words]) -> list[Number]:
         layout if layout.width == 2 or layout.order == common else replace(layout, prior=layout.prior + extra)
         for layout in REGISTERS
     ])  # fmt: skip
+
+
+def renewal_of(number: Number, readings: Mapping[Block, Words], times: Mapping[Block, Times]) -> float | None:
+    """Return the time in s between two renewals of a number while it moves; None if it has changed too seldom."""
+    block = next(block for block in readings if number.address in block.addresses)
+    first = number.address - block.address
+    own = readings[block][:, first : first + number.count]
+    renewed = times[block][1:][(own[1:] != own[:-1]).any(axis=1)]
+    return renewal_period(np.diff(renewed).tolist())
 
 
 def bytes_of(words: Words) -> Bytes:

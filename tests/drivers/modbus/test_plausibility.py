@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from otolith_drivers.modbus.options import ORDERS, Order, TypeName, orders_of, registers_of
-from otolith_drivers.modbus.plausibility import MAX_STALE_RUN, OrderMonitor, StalenessMonitor, judge_order
+from otolith_drivers.modbus.plausibility import (
+    MAX_STALE_RUN,
+    OrderMonitor,
+    StalenessMonitor,
+    judge_order,
+    renewal_period,
+)
 from otolith_drivers.modbus.schedule import plan
 from tests.drivers.registers import KINDS, item, registers
+from tests.messages import assert_says
 
 
 def encoded(numbers: Sequence[float], kind: TypeName, order: Order) -> list[list[int]]:
@@ -138,7 +145,17 @@ def test_frequent_repeats_are_accepted_with_a_warning() -> None:
     monitor, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     stale = [monitor.take(request, [index // 5, 0])[1] for index in range(1000)]
     assert not any(stale)
-    assert "80% of the readings" in monitor.warnings([request], 0.01)[0]
+    assert_says(monitor.warnings([request], 0.01)[0], "80% of the readings", 'sample_period = "50 ms"')
+
+
+@pytest.mark.parametrize("period", [0.010, 0.016, 0.1])
+def test_the_period_of_renewals_is_found_between_coarser_readings_and_rests(period: float) -> None:
+    times = np.cumsum(0.01 + 1e-3 * np.random.default_rng(1).random(500))
+    moving = times % 2.0 < 1.0
+    counts = np.floor(np.where(moving, times, np.floor(times) + 1.0) / period)
+    renewed = times[1:][np.diff(counts) > 0.0]
+    assert renewal_period(np.diff(renewed).tolist()) == pytest.approx(period, rel=0.1)
+    assert renewal_period(np.diff(renewed[:4]).tolist()) is None
 
 
 def test_registers_without_repeats_have_no_warning() -> None:

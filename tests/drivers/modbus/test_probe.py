@@ -119,7 +119,9 @@ def test_watch_reads_repeatedly_and_times_requests() -> None:
     with connected(Behaviour({3: 77})) as client:
         result = survey(client, 0, 9, never, quiet)
         client.round_trips.clear()
-        readings = watch(client, result.blocks, 0.3, never, quiet)
+        readings, times = watch(client, result.blocks, 0.3, never, quiet)
+        assert (np.diff(times[Block(0, 10)]) > 0.0).all()
+        assert len(times[Block(0, 10)]) == len(readings[Block(0, 10)])
         assert [block for block, _ in readings.items()] == [Block(0, 10)]
         words = readings[Block(0, 10)]
         assert words.shape[0] >= 5
@@ -131,7 +133,7 @@ def test_watch_reads_repeatedly_and_times_requests() -> None:
 
 def test_watch_reads_at_least_one_round() -> None:
     with connected(Behaviour({})) as client:
-        readings = watch(client, [Block(0, 2)], 0.0, never, quiet)
+        readings, _ = watch(client, [Block(0, 2)], 0.0, never, quiet)
     assert readings[Block(0, 2)].shape == (1, 2)
 
 

@@ -17,6 +17,7 @@ from otolith.cli.commissioning.draft.writing import (
     ReadSignal,
     machine_file_text,
     meaning_of,
+    period_reason,
     proposed_length,
     proposed_noise,
     proposed_period,
@@ -51,7 +52,10 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
         echo(f"! no machine file can name {', '.join(hidden)}: rename what has control characters", "")
     proposal = _twin(offers, source, answers, questions)
     signals, assumed = _signals(proposal, offers, answers, questions, source.doubt)
-    proposed = f"{1e3 * proposed_period([read.offer for read in signals.values()]):.6g} ms"
+    chosen = [read.offer for read in signals.values()]
+    proposed, why = f"{1e3 * proposed_period(chosen):.6g} ms", period_reason(chosen, source.period)
+    if answers.sample_period is None:
+        echo(f"sample period {proposed}: {why}; --sample-period states another")
     period = questions.text("Sample period", answers.sample_period or proposed, _seconds).removesuffix(" s")
     length = proposed_length(float(period), source.duration)
     window = questions.text("Length of a window", answers.window or f"{length:.9g} s", _seconds).removesuffix(" s")
@@ -65,6 +69,7 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
         assumed=assumed,
         noise=proposed_noise(signals, proposal.twin) | dict(answers.noises),
         period=float(period),
+        why=why if _seconds(proposed) == f"{period} s" else "as told",
         length=float(window),
     )
     write_machine_file(file, machine_file_text(draft))

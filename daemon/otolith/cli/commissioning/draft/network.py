@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource, unit_in
+from otolith.cli.commissioning.draft.writing import USUAL_PERIOD
 from otolith.cli.commissioning.probe import address_keys, opened_server, read_registers
 from otolith.cli.common import StopSignal, progress_line
 from otolith_drivers.base import find_driver
@@ -18,9 +19,11 @@ from otolith_drivers.grammars.toml_lines import toml_key, toml_value
 from otolith_drivers.units import is_unit
 
 if TYPE_CHECKING:
+    from otolith_drivers.modbus.probe import Number
     from otolith_drivers.opcua.connection import OpcuaOptions, Variable
 
 MAX_VARIABLES = 500  # of a server that are read
+RENEWALS = "that with which its registers change while the machine moves, as far as the device answers so often"
 READINGS = 4  # of an OPC UA server in the time of listening
 ADDRESSING = ("device", "first_address")  # keys of [driver] beside those of the line
 
@@ -35,7 +38,7 @@ def device_offers(
 ) -> OfferedSource:
     """Return the numbers that change in the registers of a device; raise DeviceError if it does not answer."""
     from otolith_drivers.modbus.options import LineOptions
-    from otolith_drivers.modbus.probe import Place, modbus_driver_lines, number_keys, possible_rate
+    from otolith_drivers.modbus.probe import Place, modbus_driver_lines, number_keys, possible_rate, renewal_of
 
     line = {name: value for name, value in keys.items() if name not in ADDRESSING}
     options = validated(address_keys(target) | line, LineOptions, ())
@@ -46,13 +49,20 @@ def device_offers(
         raise ConfigurationError(f"--registers: with first_address = {base} there is no register {first}")
     probed = read_registers(place, (first - base, last - base), seconds, stop)
     rate = possible_rate(probed.speeds)
+    fastest = 1.0 / rate if rate else 0.0
+
+    def interval(number: "Number") -> float | None:
+        """Return the time in s from one new value to the next; without one, that of answers if it is long."""
+        renewal = renewal_of(number, probed.readings, probed.times)
+        return (fastest if fastest > USUAL_PERIOD else None) if renewal is None else max(renewal, fastest)
+
     offers = [
         Offer(
             str(place.shown(number.address)),
             None,
             number_keys(place, number.address, number.part.layout),
             number.part.numbers[np.isfinite(number.part.numbers)],
-            1.0 / rate if rate else None,
+            interval(number),
         )
         for number in probed.requested
         if number.part.layout is not None
@@ -70,7 +80,7 @@ def device_offers(
         "registers have neither names nor units: read the display of the drive, and give --display SIGNAL=VALUE; "
         "or --signal SIGNAL=REGISTER, --unit REGISTER=UNIT and --scale, from a manual"
     )
-    return OfferedSource(title, lines, offers, 0.0, remarks=[remark])
+    return OfferedSource(title, lines, offers, 0.0, remarks=[remark], period=RENEWALS)
 
 
 def server_offers(

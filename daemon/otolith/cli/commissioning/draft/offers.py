@@ -49,6 +49,7 @@ class OfferedSource:
     duration: float  # s
     check: str = ""  # What 'otolith check' needs behind the machine file
     remarks: Sequence[str] = ()
+    period: str = "that of the fastest signal"  # What the sample period is, if an interval shows it
     doubt: str = ""  # What each proposal is in need of, as the source was not there
 
 

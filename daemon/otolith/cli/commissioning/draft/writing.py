@@ -40,6 +40,7 @@ class MachineDraft:
     assumed: Mapping[str, str]  # constant, slow or friction, of inputs that no sensor measures
     noise: Mapping[str, str]  # As written in the file
     period: float  # s
+    why: str  # What the sample period is
     length: float  # s
 
 
@@ -52,6 +53,13 @@ def proposed_period(offers: Sequence[Offer]) -> float:
     """Return the interval of the fastest of the ``offers`` in s, with three digits and within what a file may have."""
     fastest = min((offer.interval for offer in offers if offer.interval), default=USUAL_PERIOD)
     return float(f"{min(max(fastest, 1e-4), 10.0):.3g}")
+
+
+def period_reason(offers: Sequence[Offer], known: str) -> str:
+    """Return why the sample period is as proposed: ``known`` if an interval of the ``offers`` shows it."""
+    if any(offer.interval for offer in offers):
+        return known
+    return "assumed, as too few changes show how often the signals are renewed: let the machine move"
 
 
 def proposed_length(period: float, duration: float) -> float:
@@ -150,7 +158,8 @@ def _noise(draft: MachineDraft) -> Iterator[str]:
 
 
 def _window(draft: MachineDraft) -> Iterator[str]:
-    yield "## One estimate for each window; a record in each sample period, which is that of the fastest signal."
+    yield "## One estimate for each window; a record in each sample period:"
+    yield f"#{toml_comment(draft.why)}"
     yield "[window]"
     yield f'length = "{draft.length:.9g} s"'
     yield f'sample_period = "{1e3 * draft.period:.6g} ms"'
