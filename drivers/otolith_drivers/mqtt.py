@@ -269,6 +269,11 @@ def listener(options: MqttOptions, setup: Setup, messages: Messages) -> "MqttLis
     return MqttListener(options, messages, password(secret), _tls(options, setup.folder))
 
 
+def has_failed_first(listening: "MqttListener") -> bool:
+    """Return whether the first attempt to connect has failed; drivers have no public name for it."""
+    return listening._connection.has_failed_first
+
+
 def _tls(options: MqttOptions, folder: Path) -> ssl.SSLContext | None:
     """Return what TLS needs; the files are checked one by one first, as its own errors do not name them."""
     if not options.tls:
@@ -305,11 +310,6 @@ class MqttListener(ThreadedDriver):
     def open(self, deliver: Deliver) -> None:
         self._connection.stay_down("not connected yet")
         self._start("mqtt-listen", self._run, deliver)
-
-    @property
-    def has_failed_first(self) -> bool:
-        """Whether the first attempt to connect has failed."""
-        return self._connection.has_failed_first
 
     def counters(self) -> Counters:
         messages = self._messages

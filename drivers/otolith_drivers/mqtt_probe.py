@@ -12,7 +12,17 @@ from typing import Any
 
 from otolith_drivers.base import Sample, Setup
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.mqtt import MAX_PAYLOAD, NUMBER, PATH, Messages, MqttOptions, TopicSignals, at, listener
+from otolith_drivers.mqtt import (
+    MAX_PAYLOAD,
+    NUMBER,
+    PATH,
+    Messages,
+    MqttOptions,
+    TopicSignals,
+    at,
+    has_failed_first,
+    listener,
+)
 from otolith_drivers.toml_bounds import MAX_DEPTH
 
 ALL = "#"  # the wildcard of all topics
@@ -69,7 +79,7 @@ def observe(
     driver.open(lambda _: None)
     try:
         end = time.monotonic() + seconds
-        while time.monotonic() < end and not (stopped() or driver.has_failed_first):
+        while time.monotonic() < end and not (stopped() or has_failed_first(driver)):
             time.sleep(PAUSE)
         link = driver.link()
     finally:

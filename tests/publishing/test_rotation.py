@@ -1,5 +1,6 @@
 """A certificate is replaced by another for the same name while readers are connected, without a restart."""
 
+import errno
 import json
 import socket
 from collections.abc import Iterator
@@ -144,6 +145,24 @@ def test_renewing_keeps_hosts_and_the_old_files(site: Path) -> None:
     listed = keys("list", site).output.splitlines()
     assert [line.split()[0] for line in listed] == ["ca", "operator", "press", kept.stem]
     assert "days left" in listed[1]
+
+
+@pytest.mark.parametrize("replaced", [0, 1])
+def test_a_renewal_that_fails_leaves_the_files_as_they_were(
+    site: Path, replaced: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, done, replace = {path: path.read_bytes() for path in site.iterdir()}, list[Path](), Path.replace
+
+    def fail(path: Path, target: Path) -> Path:
+        done.append(path)
+        if len(done) == replaced + 1:
+            raise OSError(errno.EIO, "input/output error")
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with raises_saying(ConfigurationError, str(site), "input/output error"):
+        renew_certificate(site, "press", [], utc_now())
+    assert {path: path.read_bytes() for path in site.iterdir()} == before
 
 
 def test_a_file_that_is_no_certificate_hides_no_other(site: Path) -> None:

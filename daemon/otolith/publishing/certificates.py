@@ -1,6 +1,7 @@
 """Certificates: the checks of those that a session uses, and the small certificate authority of ``otolith keys``."""
 
 import os
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -173,16 +174,21 @@ def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: dateti
     stem, number = folder / f"{name}.until-{end:%Y-%m-%d}", 1
     while any(stem.with_name(f"{stem.name}.{kind}").exists() for kind in KINDS):
         stem, number = folder / f"{name}.until-{end:%Y-%m-%d}-{number + 1}", number + 1
-    moved = [(folder / f"{name}.{kind}", stem.with_name(f"{stem.name}.{kind}")) for kind in KINDS]
-    moved = [(path, kept) for path, kept in moved if path.exists()]
+    fresh = folder / f".{name}.renewal"
+    pairs = [(folder / f"{name}.{kind}", stem.with_name(f"{stem.name}.{kind}")) for kind in KINDS]
     try:
-        for path, kept in moved:
-            path.rename(kept)
-        _write(folder / name, private, certificate)
+        _remove(fresh)  # of a renewal that was ended
+        _write(fresh, private, certificate)
+        for path, kept in pairs:
+            _keep(path, kept)
+        for path, _ in pairs:  # a daemon that reads them meanwhile misses neither
+            fresh.with_name(f"{fresh.name}{path.suffix}").replace(path)
     except (OSError, ConfigurationError) as error:
-        for path, kept in moved:
+        for path, kept in pairs:
             if kept.exists():
-                kept.rename(path)
+                kept.replace(path)  # nothing, if both are names of one file
+                kept.unlink(missing_ok=True)
+        _remove(fresh)
         if isinstance(error, ConfigurationError):
             raise
         raise ConfigurationError(f"{folder}: cannot be written: {error.strerror}") from error
@@ -252,6 +258,21 @@ def _key_usage(*, authority: bool) -> x509.KeyUsage:
 def _host(text: str) -> x509.GeneralName:
     address = address_of(text)
     return x509.DNSName(text) if address is None else x509.IPAddress(address)
+
+
+def _remove(stem: Path) -> None:
+    for kind in KINDS:
+        stem.with_name(f"{stem.name}.{kind}").unlink(missing_ok=True)
+
+
+def _keep(path: Path, kept: Path) -> None:
+    """Give the file a second name; a copy where a file has one name only. A missing file is none to keep."""
+    try:
+        os.link(path, kept)
+    except FileNotFoundError:
+        return
+    except OSError:
+        shutil.copy2(path, kept)
 
 
 def _write(

@@ -98,6 +98,7 @@ class Publisher:
         # When it was last told that a certificate expires, by its end; Unix s
         self._noticed = {} if access.zenoh.tls is None else _notices(archive)
         self._refused = ""  # Why files that were replaced cannot be used
+        self._unusable: tuple[object, ...] = ()  # Stamps of the files at the latest look that could not use them
         self._sessions: tuple[_Session, ...] = ()
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
         self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
@@ -224,13 +225,16 @@ class Publisher:
         """
         with self._lock:
             sessions, access = self._sessions, self._access
+        stamps, before = access.stamps(), self._unusable
+        self._unusable = ()
         for each in sessions:
+            if each.access == access and each.stamps == stamps:
+                continue
             try:
-                if each.access == access and each.stamps == access.stamps():
-                    continue
                 self._settings(access, each.endpoints)
-            except Exception as error:  # noqa: BLE001 - one of two files may not be written yet; no bug ends the thread
-                if (reason := str(error) or type(error).__name__) != self._refused:
+            except Exception as error:  # noqa: BLE001 - a file may be half written; no bug ends the thread
+                self._unusable, reason = stamps, str(error) or type(error).__name__
+                if stamps == before and reason != self._refused:  # else the other file may follow
                     self._refused = reason
                     log.warning("%s: not taken over: %s", each.endpoints.text, reason)
                 continue
