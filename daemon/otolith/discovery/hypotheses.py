@@ -298,7 +298,8 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfi
 def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | None:
     """Return the hypothesis with what the window of ``fitted`` adds to the estimate of its delay.
 
-    None if the window contradicts the delay, or if it may be zero or is beyond those that are searched.
+    None if the window contradicts the delay, or if it may be zero, is beyond those that are searched, or has changed
+    its sign: that another signal is late is another statement.
     """
     ((signal, delay),) = tracked.problem.delays
     own = delay_score(fitted, signal)
@@ -308,7 +309,7 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
         return None
     moved = delay + own.information * own.step / information
     limit = largest_delay(fitted.window.grid.length, fitted.window.sample_period)
-    if not QUANTILE / np.sqrt(information) < abs(moved) <= limit:
+    if not QUANTILE / np.sqrt(information) < moved * np.sign(delay) <= limit:
         return None
     problem = replace(tracked.problem, delays=((signal, moved),))
     posterior = replace(tracked.posterior.moved((moved - delay) * np.array(own.shift)), problem=problem)

@@ -228,26 +228,32 @@ def _instead_of_components(item: FittedHypothesis, best: Fit) -> Proposal:
 
 
 def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
-    """Return the hypotheses that one signal is late or early against all others, for those of the largest ``gains``."""
+    """Return the hypotheses that one signal is late or early against all others, for those of the largest ``gains``.
+
+    A signal is early if all others are late by the same time. If only one other shows a delay at all, that one is late.
+    """
     least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
+    may_be_early = sum(gain > 0.0 for gain in gains.tolist()) > 2
     return [
-        _late_signal(null, index)
+        _late_signal(null, index, may_be_early=may_be_early)
         for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist()
         if gains[index] > least
     ]
 
 
-def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
+def _late_signal(null: FittedHypothesis, index: int, *, may_be_early: bool) -> FittedHypothesis:
     """Fit the delay of one signal: the best of a grid, then Gauss-Newton steps of the delay."""
     window, names = null.fit.window, delayable(null.problem.base_model)
     limit = largest_delay(window.grid.length, window.sample_period)
+    earliest = -limit if may_be_early else 0.0
     stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
 
     def proposal(delay: float) -> Proposal:
-        late = replace(null.problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
+        late = replace(null.problem, delays=((names[index], float(np.clip(delay, earliest, limit))),))
         return Proposal(stated, late, null.fit.prior, null.fit.prior.mean)
 
     periods = trial_delays(1.0, limit / window.sample_period)
+    periods = periods[periods * window.sample_period >= earliest]
     # Late by whole periods, regular samples stay in common records: else there would be twice as many.
     delays = (window.sample_period * np.unique(np.where(np.abs(periods) < 1.0, periods, np.rint(periods)))).tolist()
     (best,) = fit_hypotheses([_best_of_grid(proposal, delays, window)], window)
