@@ -191,7 +191,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     if with_driver and (file.drivers or file.read_signals or not for_replay):
         driver = build_driver(driver_configs(file, twin, source))
     varying = frozenset(item.name for item in unmeasured if item.assumption is Assumption.CONSTANT)
-    plan = replace(_plan(file, twin, problem, context), varying=varying)
+    plan = replace(_plan(file, twin, complete, problem, context), varying=varying)
     return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured)
 
 
@@ -328,7 +328,9 @@ def _parameter(parameter: Parameter, table: ParameterTable, context: Context, *,
     return replace(parameter, nominal=value, low=low, high=high)
 
 
-def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Context) -> MonitoringPlan:
+def _plan(
+    file: MachineFile, twin: Definition, complete: Definition, problem: Problem, context: Context
+) -> MonitoringPlan:
     """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
     free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
     for name, table in file.parameters.items():
@@ -343,6 +345,8 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         name: _monitored(row, file.parameters.get(name, LimitsTable()), ("parameters", name), context)
         for name, row in free.items()
     }
+    own = _own_values(file, twin, complete)
+    parameters = _waiting(parameters, own | _with_own_limits(file))
     for name, quantity in parameters.items():
         table = file.parameters.get(name, ParameterTable())
         parameters[name] = _with_temperature(quantity, free[name], table, twin, context)
@@ -354,11 +358,40 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         for name, row in amplitudes.items()
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
+    known = _waiting(known, own)
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)
     rules = (*(Rule(**rule.model_dump(), is_own=True) for rule in file.rule), *load_rules(language))
     return MonitoringPlan(parameters, components, rules, language=language, timezone=zone, known=known, signals=signals)
+
+
+def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> frozenset[str]:
+    """Return the parameters whose nominal values are those of this machine, so that they may be judged by them.
+
+    A friction that stands for an unmeasured load too is not known from a data sheet of the motor.
+    """
+    written = {name for name, table in file.parameters.items() if table.value is not None}
+    of_twin = {row.name: row for row in complete.parameters}
+    added = {row.name for row in twin.parameters} - of_twin.keys()
+    return frozenset(row.name for row in twin.parameters if row == of_twin.get(row.name)) | (added & written)
+
+
+def _with_own_limits(file: MachineFile) -> frozenset[str]:
+    """Return the parameters whose limits the file has."""
+    tables = file.parameters.items()
+    return frozenset(name for name, table in tables if table.watch is not None or table.act is not None)
+
+
+def _waiting(quantities: Mapping[str, MonitoredQuantity], judged: Collection[str]) -> dict[str, MonitoredQuantity]:
+    """Return the quantities; the limits in percent of those that are not ``judged`` wait for a baseline."""
+    found = dict(quantities)
+    for name in quantities.keys() - judged:
+        limits, quantity = {True: list[Limit](), False: list[Limit]()}, quantities[name]
+        for limit in quantity.limits:
+            limits[limit.is_relative].append(limit)
+        found[name] = replace(quantity, limits=tuple(limits[False]), waiting=tuple(limits[True]))
+    return found
 
 
 def _known(parameter: Parameter, context: Context) -> MonitoredQuantity:

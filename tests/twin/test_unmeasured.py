@@ -68,14 +68,30 @@ def test_friction_adds_only_what_the_twin_lacks(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize(("name", "own"), [("dc_motor", {"D"}), ("dc_motor_coulomb", {"D", "T_c"})])
 def test_friction_of_the_twin_is_then_that_of_the_load_too(name: str, own: set[str]) -> None:
-    """Limits of the motor alone would be an alarm on the first day."""
     twin = find_twin(name)
     without = without_sensor(twin, UnmeasuredInput("T_load", Assumption.FRICTION))
     for row in twin.parameters:
         now = without.parameter(row.name)
         assert (now != row) == (row.name in own)
         assert now.high > row.high or now == row
-        assert not (now.watch or now.act) or now == row
+        assert (now.watch, now.act, now.part) == (row.watch, row.act, row.part)
+
+
+@pytest.mark.parametrize("name", LOADED)
+@pytest.mark.parametrize(
+    ("kind", "expression"), [(Assumption.FRICTION, ""), (Assumption.PROPORTIONAL, "omega*abs(omega)")]
+)
+def test_what_stands_for_a_load_has_limits_and_a_part(name: str, kind: Assumption, expression: str) -> None:
+    """A friction that doubles must not be OK for want of a limit."""
+    twin = find_twin(name)
+    of_load = "omega_l*abs(omega_l)" if expression and name == "two_mass" else expression
+    without = without_sensor(twin, UnmeasuredInput("T_load", kind, of_load))
+    added = [row for row in without.parameters if row not in twin.parameters and row.role is Role.ESTIMATED]
+    assert added
+    for row in added:
+        assert row.watch, row.name
+        assert row.act, row.name
+        assert row.part == ("bearing" if kind is Assumption.FRICTION else "load")
 
 
 def test_a_twin_without_viscous_friction_gets_it() -> None:

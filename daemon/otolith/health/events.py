@@ -362,7 +362,7 @@ def history_point(plan: MonitoringPlan, report: ReportDocument, name: str) -> tu
     """
     item, quantity = report.parameters[name], plan.parameters.get(name)
     is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
-    if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
+    if quantity is None or not quantity.has_limits or not is_new or item.value is None or not item.sd:
         return None
     time, value, sd = report.window.end, item.value, item.sd
     if report.decision is WindowDecision.LEARNED and item.raw is not None and item.raw_sd:
@@ -379,7 +379,7 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
         if (point := history_point(plan, report, name)) is None:
             continue
         histories[name] = with_point(histories.get(name, ()), *point)
-        if is_due(forecasts.get(name), histories[name]):
+        if plan.parameters[name].limits and is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(plan.parameters[name], histories[name])
         own, now = forecasts.get(name), report.window.end
         if seen := seen_trend(plan.parameters[name], histories[name], own, trends.get(name), now):

@@ -64,6 +64,7 @@ class MonitoredQuantity:
     unit: str = ""
     nominal: float = 0.0
     limits: tuple[Limit, ...] = ()
+    waiting: tuple[Limit, ...] = ()  # Limits in percent of a value that is not known yet: they wait for a baseline
     temperature_coefficient: float = 0.0  # Relative change per kelvin
     temperature: str = ""  # Signal of the temperature, K; empty if it is not measured
     reference: float = 293.15  # Temperature for which nominal value and limits are stated, K
@@ -83,9 +84,16 @@ class MonitoredQuantity:
         return (value / factor, sd / factor) if factor > MIN_TEMPERATURE_FACTOR else None
 
     @property
+    def has_limits(self) -> bool:
+        """Whether it has limits, or will have them with a baseline."""
+        return bool(self.limits or self.waiting)
+
+    @property
     def limits_text(self) -> str:
         """The limits in words; empty without one."""
-        texts = (f"{item.level} {item.side} {quantity_text(item.value, self.unit)}" for item in self.limits)
+        texts = [f"{item.level} {item.side} {quantity_text(item.value, self.unit)}" for item in self.limits]
+        shares = [f"{item.level} {item.value / self.nominal - 1.0:+.0%}" for item in self.waiting]
+        texts += [f"{', '.join(shares)} of the baseline, none yet: run 'otolith commission'"] if shares else []
         return ", ".join(texts)
 
     def level(self, value: float, sd: float, before: Level, held: float | None = None) -> tuple[Level, Limit | None]:

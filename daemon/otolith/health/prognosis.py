@@ -372,7 +372,8 @@ def find_baseline(history: History, quantity: MonitoredQuantity) -> BaselineSear
     if QUANTILE * sd >= MAX_BASELINE_SHARE * abs(value):
         return BaselineSearch(None, left, interval, f"its interval is {_share(sd, value)} of the value")
     known = Baseline(value, sd, len(values), float(times[-1]))
-    relative = [abs(limit.value / quantity.nominal - 1.0) for limit in quantity.limits if limit.is_relative]
+    limits = (*quantity.limits, *quantity.waiting)
+    relative = [abs(limit.value / quantity.nominal - 1.0) for limit in limits if limit.is_relative]
     reason = ""
     if relative and QUANTILE * sd > min(relative) * abs(value):
         reason = f"its interval is {_share(sd, value)} of the value, wider than its nearest limit ({min(relative):.0%})"
@@ -391,14 +392,15 @@ def with_baselines(plan: MonitoringPlan, known: Mapping[str, Baseline]) -> Monit
 
 
 def with_baseline(quantity: MonitoredQuantity, baseline: Baseline | None) -> MonitoredQuantity:
-    """Return a parameter whose relative limits refer to ``baseline``; without one, to the nominal value."""
+    """Return a parameter whose relative limits refer to ``baseline``; without one, it is as the machine file has it."""
     ratio = baseline.value / quantity.nominal if baseline is not None and quantity.nominal else 0.0
     if baseline is None or not 0.0 < ratio < math.inf:
         return quantity
     limits = tuple(
-        replace(limit, value=ratio * limit.value) if limit.is_relative else limit for limit in quantity.limits
+        replace(limit, value=ratio * limit.value) if limit.is_relative else limit
+        for limit in (*quantity.limits, *quantity.waiting)
     )
-    return replace(quantity, nominal=baseline.value, limits=limits, has_baseline=True)
+    return replace(quantity, nominal=baseline.value, limits=limits, waiting=(), has_baseline=True)
 
 
 @dataclass(frozen=True, slots=True)

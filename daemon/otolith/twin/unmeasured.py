@@ -6,6 +6,7 @@ their author wrote them. ``docs/describe-your-machine.md`` explains when to use 
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 
@@ -32,6 +33,9 @@ USUAL_SHARE, LEAST_SHARE = 0.1, 0.01  # of a state's largest value: where the lo
 DRY_SHARE = 0.05  # of the range's largest value: dry friction at which a search begins
 TRANSITIONS = {"rad": (0.05, 0.5, 5.0), "m": (1e-4, 2e-3, 5e-2)}
 """Lowest, nominal and highest speed within which dry friction changes sign, in rad/s or m/s."""
+FRICTION_LIMITS = (("+50 %",), ("+100 %",))  # WATCH and ACT, as of the frictions of the library's twins
+FACTOR_LIMITS = (("-20 %", "+20 %"), ("-40 %", "+40 %"))  # WATCH and ACT, as of the torque of the library's fan
+LOAD = "load"  # part to which belongs what stands for a load, unless the twin has a part with friction there
 SPEEDS = np.array([0.1, 0.2, 0.4, -0.1, -0.2, -0.4])  # of a state's largest value: where frictions are compared
 SAME_SHAPE = 1e-6  # relative difference up to which a term of the twin is the friction it is compared with
 
@@ -89,6 +93,8 @@ def without_sensor(definition: Definition, item: UnmeasuredInput) -> Definition:
             changed = _with_friction(definition, rest, driven)
         case Assumption.PROPORTIONAL:
             factor = _factor(rest, driven, item.expression, "factor", "factor of")
+            watch, act = FACTOR_LIMITS
+            factor = replace(factor, part=LOAD, watch=watch, act=act)
             changed = _with_terms(rest, driven, [f"{factor.name}*({item.expression})"], [factor])
     taken = rest.units().keys() | {name for name, _, _ in rest.definitions}
     for parameter in changed.parameters[len(rest.parameters) :]:
@@ -159,21 +165,25 @@ def _values(definition: Definition, share: float) -> dict[str, Array]:
 def _with_friction(definition: Definition, rest: Definition, driven: Input) -> Definition:
     """Return the twin with friction in place of an input, as far as the twin does not have that friction itself.
 
-    The friction that the twin has is then that of the load too: its bounds are wider, and its limits do not hold. That
-    which is added may be slightly negative, so that none is an estimate within the bounds.
+    The friction that the twin has is then that of the load too: its bounds are wider. That which is added may be
+    slightly negative, so that none is an estimate within the bounds; it belongs to the part with the friction that the
+    twin has.
     """
     frictions, largest = _Frictions(definition, driven), _largest(driven.low, driven.high)
     speed, place = frictions.speed, integral_unit(frictions.speed.unit)
+    parts = [row.part for row in definition.parameters if row.name in (*frictions.viscous, *frictions.dry) and row.part]
+    watch, act = FRICTION_LIMITS
+    limited = partial(replace, part=parts[0] if parts else LOAD, watch=watch, act=act)
     terms: list[str] = []
     added: list[Parameter] = []
     viscous = _factor(rest, driven, speed.name, "viscous", "viscous friction in")
     if not frictions.viscous:
-        added.append(replace(viscous, low=-viscous.nominal))
+        added.append(limited(replace(viscous, low=-viscous.nominal)))
         terms.append(f"{viscous.name}*{speed.name}")
     if not frictions.dry:
         dry, transition = f"{driven.name}_dry", f"{driven.name}_speed"
         size, meaning = DRY_SHARE * largest, f"dry friction in {driven.meaning}"
-        added.append(Parameter(dry, driven.unit, size, -size, largest, meaning, Role.ESTIMATED))
+        added.append(limited(Parameter(dry, driven.unit, size, -size, largest, meaning, Role.ESTIMATED)))
         low, nominal, high = TRANSITIONS[place]
         meaning = "speed within which dry friction changes sign"
         added.append(Parameter(transition, f"{place}/s", nominal, low, high, meaning))
@@ -181,9 +191,7 @@ def _with_friction(definition: Definition, rest: Definition, driven: Input) -> D
     of_load = dict.fromkeys(frictions.viscous, viscous.high * to_base(viscous.unit)[0])
     of_load |= dict.fromkeys(frictions.dry, largest * to_base(driven.unit)[0])
     wider = tuple(
-        replace(row, high=row.high + of_load[row.name] / to_base(row.unit)[0], watch=(), act=())
-        if row.name in of_load
-        else row
+        replace(row, high=row.high + of_load[row.name] / to_base(row.unit)[0]) if row.name in of_load else row
         for row in rest.parameters
     )
     return _with_terms(replace(rest, parameters=wider), driven, terms, added)

@@ -27,6 +27,7 @@ MIN_SHARE = 0.5  # of the samples expected at the sample period; below it the ex
 PAUSE = 0.1  # s between two looks at the driver
 PROBED = ("can", "modbus")  # drivers that have an 'otolith probe'
 NO_LIMITS = "none, so no change of it is an event: write {} = {{ watch = {} }} under [parameters]"
+NONE_HAS_LIMITS = "no limits of {}, so no change of them is an event: write for example {} = {{ watch = {} }}"
 FOR_REPLAY_ONLY = "no [driver] and no [signals]: for 'otolith replay' only"
 
 
@@ -118,6 +119,15 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
+
+
+def lines_without_limits(machine: LoadedMachine) -> list[str]:
+    """Return a line that names the estimated parameters without limits, and says what to write; none if all have."""
+    rows = [row for row in machine.problem.free if not machine.plan.parameters[row.name].has_limits]
+    if len(rows) < 2:
+        return [f"limits of {row.name}: {NO_LIMITS.format(row.name, _example_limits(row))}" for row in rows]
+    names = ", ".join(row.name for row in rows)
+    return [f"{NONE_HAS_LIMITS.format(names, rows[0].name, _example_limits(rows[0]))} under [parameters]"]
 
 
 def _example_limits(free: Parameter) -> str:

@@ -512,10 +512,11 @@ def keep_baseline(
     Raises:
         ConfigurationError: no parameter has a baseline.
     """
+    from otolith.cli.commissioning.check import lines_without_limits
     from otolith.health.prognosis import find_baseline
     from otolith_drivers.errors import ConfigurationError
 
-    limited = {name: row for name, row in machine.plan.parameters.items() if row.limits}
+    limited = {name: row for name, row in machine.plan.parameters.items() if row.has_limits}
     found = {name: find_baseline(histories.get(name, ()), row) for name, row in limited.items()}
     kept = {name: row.baseline for name, row in found.items() if row.baseline is not None}
     if labels is not None:
@@ -535,6 +536,7 @@ def keep_baseline(
             few = f"{search.vague} estimates of {name} are not counted"
             why = f"near standstill, or without a change, a window shows it to ±{search.interval:.2g} only"
             lines.append(f"  {few}: {why}")
+    lines += lines_without_limits(machine)
     if not kept:
         lines.insert(0, f"no baseline: {'none of its parameters has limits' if not limited else 'too little is known'}")
         raise ConfigurationError("\n".join(f"{machine.path}: {line.strip()}" for line in lines))

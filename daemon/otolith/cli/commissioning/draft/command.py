@@ -138,8 +138,10 @@ def _finish(
     file: Path, source: "OfferedSource", answers: "Answers", questions: Questions, *, commissions: bool
 ) -> None:
     """Write the file, commission the machine by its log if that is wanted, and name the next command."""
+    from otolith.cli.commissioning.check import lines_without_limits
     from otolith.cli.commissioning.commission import WINDOWS, ask_if_healthy, commission_log
     from otolith.cli.commissioning.draft.choosing import next_lines, write_draft
+    from otolith.machine import load_machine
 
     if commissions and not source.check:
         raise click.UsageError("--commission needs a log: --csv, or --dbc with --log")
@@ -149,6 +151,8 @@ def _finish(
             ask_if_healthy if questions.asks else lambda: None
         )  # what nobody was asked is no part of a healthy machine
         commission_log(file, Path(source.check), WINDOWS, decide=decide, write=True)
+    else:
+        echo(*lines_without_limits(load_machine(file, with_driver=False)))
     echo(*next_lines(file, source, is_commissioned=commissions))
 
 
