@@ -8,11 +8,17 @@ from otolith.health.diagnosis import KEYS, FindingFeatures, Rule, diagnose, matc
 from otolith.health.schema import FindingKind
 from otolith.machine import find_twin, library_twins, load_rules
 from otolith.twin.components import FAMILY_NAMES
+from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from tests.messages import assert_says
 
 RULES = load_rules()
 TWINS = {name: find_twin(name) for name in library_twins()}
-PARAMETERS = {parameter.name for twin in TWINS.values() for parameter in twin.parameters}
+WITHOUT_LOAD = [
+    without_sensor(twin, UnmeasuredInput("T_load", Assumption.FRICTION))
+    for twin in TWINS.values()
+    if "T_load" in {row.name for row in twin.inputs}
+]
+PARAMETERS = {parameter.name for twin in (*TWINS.values(), *WITHOUT_LOAD) for parameter in twin.parameters}
 SITES = {site.name for twin in TWINS.values() for site in twin.sites}
 
 
