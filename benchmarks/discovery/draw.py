@@ -18,7 +18,8 @@ from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import LinearResponse, basis_functions
-from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
+from otolith.discovery.screening import ScreeningResult, candidate_library
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import Prior
 from otolith.twin.components import COMPONENT_FAMILIES, ComponentFamily, SourceKind, sites, sources
 

@@ -9,7 +9,7 @@ from benchmarks.discovery.draw import Case, draw
 from benchmarks.discovery.setting import RankedHypotheses, problem, search_and_rank
 from benchmarks.discovery.truth import same
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
-from otolith.discovery.screening import DECISIVE
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.problem import indices
 
 BAYES_FACTOR_150 = 2.0 * math.log(150.0)  # in -2 log evidence: decides between two hypotheses

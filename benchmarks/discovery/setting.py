@@ -10,6 +10,7 @@ from otolith.acquisition.window import Window
 from otolith.discovery.hypotheses import FittedHypothesis
 from otolith.discovery.screening import ScreeningResult, linearised
 from otolith.discovery.search import screening_test, search
+from otolith.estimation.evidence import discount
 from otolith.estimation.information import Prior
 from otolith.estimation.problem import Problem
 from otolith.machine import load_machine
@@ -59,8 +60,9 @@ def search_and_rank(problem: Problem, window: Window, known: Prior) -> RankedHyp
     screening = screen(problem, window, known)
     hypotheses = search(screening)
     count = screening.response.objective.count
-    unexplained = max(1.0, min(hypothesis.chi_square for hypothesis in hypotheses) / count)
-    pairs = sorted(((hypothesis.deviance(count, unexplained), index) for index, hypothesis in enumerate(hypotheses)))
+    unexplained = discount(min(hypothesis.chi_square for hypothesis in hypotheses), count)
+    deviances = (hypothesis.evidence(count, unexplained).deviance for hypothesis in hypotheses)
+    pairs = sorted((deviance, index) for index, deviance in enumerate(deviances))
     return RankedHypotheses(
         tuple(hypotheses[index] for _, index in pairs),
         tuple(deviance for deviance, _ in pairs),

@@ -25,8 +25,8 @@ from otolith.discovery.hypotheses import (
     nothing_happened,
     with_candidate,
 )
-from otolith.discovery.screening import NULL_ODDS, prior_deviance
 from otolith.discovery.search import fit_hypotheses
+from otolith.estimation.evidence import NULL_ODDS, prior_deviance
 from otolith.estimation.information import Prior, forget_parameter, initial_prior
 from otolith.estimation.problem import Component, Problem
 from otolith.machine import find_twin

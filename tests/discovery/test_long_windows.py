@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from otolith.discovery.screening import DECISIVE, screen_window
+from otolith.discovery.screening import screen_window
 from otolith.discovery.sequential_test import continue_test, open_test
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.window_fit import estimate_window
 from tests.discovery.test_experiment_design import CURRENT, PERIOD, SPEED, STEADY, steady, window
 

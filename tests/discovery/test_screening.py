@@ -17,7 +17,6 @@ from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.discovery.linear_response import PROBES, LinearResponse, basis_functions
 from otolith.discovery.screening import (
     COARSE,
-    DECISIVE,
     ESTIMATE_SHARE,
     ScreeningResult,
     allowed_forms,
@@ -25,6 +24,7 @@ from otolith.discovery.screening import (
     inner_grid,
     screen_window,
 )
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem

@@ -14,7 +14,8 @@ from otolith.discovery.hypotheses import (
     prune,
     without_insignificant,
 )
-from otolith.discovery.sequential_test import FilterEvidence, FitSummary, SequentialTest, WindowCounts, join
+from otolith.discovery.sequential_test import FilterEvidence, SequentialTest, WindowCounts, join
+from otolith.estimation.evidence import LogEvidence
 from otolith.estimation.information import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment
@@ -90,9 +91,9 @@ def test_what_opened_a_test_has_ended_where_the_filter_alone_explains_a_window(e
     null, moved = hypothesis(FaultType.NOTHING, BARE), hypothesis(FaultType.PARAMETER, BARE)
     wrong = hypothesis(FaultType.SENSOR, augment(BARE, [PERIODIC]))
     wrong = replace(wrong, cost=5.0)
-    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, FitSummary(9000.0), WindowCounts(tested=15))
+    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, LogEvidence(9000.0), WindowCounts(tested=15))
     others = (null, moved.worse_by(5.0, 0.0)) if ended else (moved, null.worse_by(15.0, 15.0))
-    fresh = SequentialTest(BARE, others, 30.0, FitSummary(400.0))
+    fresh = SequentialTest(BARE, others, 30.0, LogEvidence(400.0))
     joined = join(old, fresh)
     assert joined.best.type is (FaultType.NOTHING if ended else FaultType.PARAMETER)
     assert (joined is fresh) == ended
@@ -110,7 +111,7 @@ def test_a_sensor_is_named_only_if_no_structure_is_left(inflation: float, named:
 
 def evidence_after(*differences: float) -> FilterEvidence:
     """Evidence about the filter after windows in which its χ² exceeds the best by so many variance factors."""
-    evidence, best = FilterEvidence(), FitSummary(chi_square=400.0, variance_factor=2.0)
+    evidence, best = FilterEvidence(), LogEvidence(400.0, discount=2.0)
     for difference in differences:
         evidence = evidence.after(400.0 + 2.0 * difference, best)
     return evidence

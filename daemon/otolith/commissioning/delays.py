@@ -12,7 +12,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, with_initial_noise
 from otolith.commissioning.likelihood import FIRST_FITS, FittedWindow, Likelihood, Progress
-from otolith.discovery.screening import DECISIVE
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import (

@@ -37,8 +37,8 @@ from otolith.commissioning.likelihood import (
     with_levels,
 )
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
-from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.global_search import search_window
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -452,7 +452,7 @@ def _observable_process_noise(problem: Problem, sensors: Array, window: Window) 
 def _log_variance(problem: Problem, levels: Array, window: Window) -> float:
     """Mean logarithm of the innovations' variances."""
     objective = Objective(with_levels(problem, levels), window, problem.nominal)
-    return objective.innovation_model.log_determinant / objective.count
+    return objective.spread / objective.count
 
 
 def _most_excited(problem: Problem, windows: Sequence[Window], sensors: Array) -> Window:

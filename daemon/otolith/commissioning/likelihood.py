@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
+from otolith.estimation.evidence import LogEvidence, log_determinant
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -126,9 +127,9 @@ class Likelihood:
         return FittedWindow(window, objective, centre, result)
 
     def _deviance(self, objective: Objective, chi_square: float, jacobian: Array) -> float:
-        """χ² + ln|covariance of the innovations| + ln|information about the guess|."""
-        _, log_determinant = np.linalg.slogdet(self._information(jacobian))
-        return chi_square + objective.innovation_model.log_determinant + float(log_determinant)
+        """-2 log evidence of a window: see :mod:`otolith.estimation.evidence`."""
+        complexity = float(log_determinant(self._information(jacobian)))
+        return LogEvidence(chi_square + objective.spread, complexity).deviance
 
     def project(self, residuals: Array, jacobian: Array) -> Array:
         """(residuals,) or (residuals, columns) the part that no change of the guess explains, after a new fit."""

@@ -21,7 +21,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import sample_noise, usable_windows, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
-from otolith.discovery.screening import DECISIVE
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective

@@ -33,7 +33,8 @@ from otolith.discovery.linear_response import (
     basis_functions,
 )
 from otolith.discovery.noise_hypothesis import likelier_levels_of
-from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
+from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import initial_prior, orthonormal_basis
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD

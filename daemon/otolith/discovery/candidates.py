@@ -13,7 +13,6 @@ from otolith.acquisition.window import Array
 from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange, scales_a_sum
 from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse, basis_functions
 from otolith.discovery.screening import (
-    DECISIVE,
     CompetingForms,
     ScoredGuess,
     ScoredGuesses,
@@ -21,8 +20,8 @@ from otolith.discovery.screening import (
     grid_guesses,
     highest_lines,
     inner_grid,
-    prior_deviance,
 )
+from otolith.estimation.evidence import DECISIVE, prior_deviance
 from otolith.estimation.problem import Component, Problem, key_of
 from otolith.twin.components import measured_speeds, sites, sources
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
 
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
-from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, indices, site_of, slot_of

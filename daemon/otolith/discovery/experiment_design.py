@@ -15,7 +15,8 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.discovery.linear_response import chi_square_of_parameters
-from otolith.discovery.screening import DECISIVE, linearised
+from otolith.discovery.screening import linearised
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE, Prior, information
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -148,5 +149,5 @@ def _of_noise(wrong: Fit, true: Fit) -> float:
         return 0.0
     whitening = wrong.objective.whitening
     whitened = whitening @ np.linalg.inv(true.objective.whitening)
-    determinants = wrong.objective.innovation_model.log_determinant - true.objective.innovation_model.log_determinant
+    determinants = wrong.objective.spread - true.objective.spread
     return float((whitened**2).sum() - whitening.shape[0] * whitening.shape[1] + determinants)

@@ -1,8 +1,7 @@
 """Hypotheses about a window: nothing, parameters moved, a component appeared, a sensor is wrong, a signal is late.
 
-A hypothesis is fitted to a window under its own prior and compared by evidence, in the form of the Bayesian information
-criterion (G. Schwarz, Annals of Statistics 6, 1978). A fitted hypothesis becomes a tracked one, which carries its own
-posterior from window to window.
+A hypothesis is fitted to a window under its own prior and compared by evidence (:mod:`otolith.estimation.evidence`). A
+fitted hypothesis becomes a tracked one, which carries its own posterior from window to window.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,7 +12,15 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
-from otolith.discovery.screening import DECISIVE, prior_deviance
+from otolith.estimation.evidence import (
+    DECISIVE,
+    NO_EVIDENCE,
+    LogEvidence,
+    discount,
+    log_determinant,
+    penalty,
+    prior_deviance,
+)
 from otolith.estimation.information import QUANTILE, Evidence, Prior, extend_prior, initial_prior, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment, equation, indices, site_of
@@ -57,6 +64,10 @@ class FaultHypothesis:
     def prior_deviance(self) -> float:
         """-2 log of the prior odds against the null hypothesis; those of a type share its probability."""
         return 0.0 if self.type is FaultType.NOTHING else float(prior_deviance(self.alternatives))
+
+    def penalty(self, count: float) -> float:
+        """Return the penalty of its values, of which nothing was known before ``count`` measured ones, and its odds."""
+        return 0.0 if self.type is FaultType.NOTHING else float(penalty(self.added, count, self.alternatives))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,13 +115,9 @@ class FittedHypothesis:
         """χ² that is left, in the noise of the hypothesis."""
         return self.fit.chi_square if self.type is FaultType.NOISE else self.chi_square
 
-    def deviance(self, count: float, variance_factor: float) -> float:
-        """Return -2 log evidence of ``count`` measured values.
-
-        ``variance_factor``: the best hypothesis leaves this many times the noise variance.
-        """
-        stated = self.hypothesis
-        return float(self.chi_square / variance_factor + stated.added * np.log(count) + stated.prior_deviance)
+    def evidence(self, count: float, divisor: float) -> LogEvidence:
+        """Return the evidence of ``count`` measured values, with ``divisor`` as the discount."""
+        return LogEvidence(self.chi_square, self.hypothesis.penalty(count), divisor)
 
 
 def nothing_happened(problem: Problem, prior: Prior) -> Proposal:
@@ -172,14 +179,9 @@ def _names(problem: Problem) -> str:
     return " and ".join(component.key for component in problem.components)
 
 
-def residual_variance_factor(chi_squares: Iterable[float], count: float) -> float:
-    """Return how many times the noise variance even the best hypothesis leaves; at least one."""
-    return max(min(chi_squares) / count, 1.0)
-
-
 def largest_chi_square(least: float, count: float) -> float:
     """Return the χ² above which a hypothesis is far less likely than the best one, which leaves ``least``."""
-    return least + MAX_DEVIANCE * max(least / count, 1.0)
+    return least + MAX_DEVIANCE * discount(least, count)
 
 
 def evidence_factor(fitted: Iterable[FittedHypothesis]) -> float:
@@ -250,8 +252,7 @@ class HypothesisStep:
     predicted: Posterior
     fitted: FittedHypothesis
     evidence: Evidence
-    deviance: float = 0.0  # -2 log evidence of this window
-    misfit: float = 0.0  # The same without the complexity
+    log_evidence: LogEvidence = NO_EVIDENCE  # Of this window
 
     @property
     def is_usable(self) -> bool:
@@ -350,9 +351,9 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
-    """Return log det(I + R P Rᵀ): the term of -2 log evidence that penalises an uncertain prediction."""
+    """Return ln|I + R P Rᵀ|: the term of -2 log evidence that penalises an uncertain prediction."""
     information = evidence.sqrt_information @ predicted.prior().covariance @ evidence.sqrt_information.T
-    return float(np.linalg.slogdet(np.eye(len(information)) + information)[1])
+    return float(log_determinant(np.eye(len(information)) + information))
 
 
 def prune(tracked: Sequence[TrackedHypothesis], deviances: Sequence[float]) -> list[TrackedHypothesis]:

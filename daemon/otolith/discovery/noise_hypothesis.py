@@ -15,8 +15,8 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis, largest_chi_square
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
-from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
+from otolith.estimation.evidence import DECISIVE, LogEvidence
 from otolith.estimation.information import information
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
@@ -77,7 +77,7 @@ def _at_larger_levels(around: Fit, null: Fit, max_deviance: float) -> Fit | None
     None as well if χ² and normalisation exceed ``max_deviance``. A sensor that would be useless makes no hypothesis.
     """
     stated, useless = np.array(null.problem.levels), MAX_NOISE_FACTOR * np.array(null.problem.noise)
-    max_deviance += null.objective.innovation_model.log_determinant
+    max_deviance += null.objective.spread
     unstated = input_noise_bounds(null.problem, null.window) > 0.0
     inputs = np.pad(unstated, (0, len(stated) - len(unstated)))
     there = replace(around, problem=null.problem).linearised_at_end()
@@ -205,8 +205,8 @@ def _at(trial: Fit, levels: Array) -> Fit:
 
 
 def _deviance(trial: Fit) -> float:
-    """Return -2 log likelihood of a window around which the twin is linearised."""
-    return chi_square_of_parameters(trial) + trial.objective.innovation_model.log_determinant
+    """Return -2 log evidence of a window around which the twin is linearised; all levels have the same complexity."""
+    return LogEvidence(chi_square_of_parameters(trial) + trial.objective.spread).deviance
 
 
 def likelier_levels_of(fitted: Fit) -> Problem:
@@ -225,7 +225,7 @@ def likelier_levels_of(fitted: Fit) -> Problem:
 
 def normalisation(fitted: Fit, reference: Fit) -> float:
     """Return by how much -2 log likelihood of ``fitted`` exceeds its χ², against ``reference``."""
-    own, other = (each.objective.innovation_model.log_determinant for each in (fitted, reference))
+    own, other = (each.objective.spread for each in (fitted, reference))
     return own - other
 
 

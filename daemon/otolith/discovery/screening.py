@@ -12,6 +12,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, candidate_table
 from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse
+from otolith.estimation.evidence import DECISIVE, discount, penalty
 from otolith.estimation.information import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
@@ -28,8 +29,6 @@ from otolith.twin.components import (
 )
 from otolith.twin.definition import Definition
 
-DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
-NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 FRICTION_OF_INPUT = 100.0  # how much less probable than of a state: 9.2 in -2 log evidence, just below DECISIVE
 COARSE = 1.5  # spectral lines between two frequencies
 ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral line whose gain is computed
@@ -38,11 +37,6 @@ PEAKS_OF_SPECTRUM = 8  # of largest estimated gain, whose gain a search computes
 MAX_AMPLITUDE = 1e9  # in the unit of the site
 SAME_SIGN = 0.8  # mean product of the signs of two sources that change their signs together
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
-
-
-def prior_deviance(alternatives: float | Array) -> Array:
-    """Return -2 log of the prior odds of one of so many hypotheses of a type against the null hypothesis."""
-    return np.asarray(2.0 * np.log(NULL_ODDS * alternatives))
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,8 +224,8 @@ class ScoredGuesses:
         forms = {id(form): form for form, _ in guesses}  # there are far fewer than guesses, and to compare them is slow
         of_form = {key: (float(_parameter_count(form)), competing.of(form)) for key, form in forms.items()}
         parameters, competitors = np.array([of_form[id(form)] for form, _ in guesses]).reshape(-1, 2).T
-        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(count) - prior_deviance(competitors)
+        divisor = discount(response.chi_square - float(statistics.gain.max(initial=0.0)), count)
+        scores = statistics.gain / divisor - penalty(parameters, count, competitors)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
 
     def __getitem__(self, index: int) -> ScoredGuess:
@@ -288,8 +282,7 @@ def _delay_gain(response: LinearResponse) -> float:
     """Return what a late signal would gain at most, minus what is decisive; parameters would absorb a part of it."""
     gains = response.score_delays().gain
     best, count = float(gains.max(initial=0.0)), response.objective.count
-    variance_factor = max((response.chi_square - best) / count, 1.0)
-    return float(best / variance_factor - np.log(count) - prior_deviance(len(gains))) - DECISIVE
+    return best / discount(response.chi_square - best, count) - float(penalty(1.0, count, len(gains))) - DECISIVE
 
 
 def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> Fit:
@@ -305,7 +298,7 @@ def _linear_response(fitted: Fit) -> LinearResponse:
     """
     response = LinearResponse(fitted)
     error = response.chi_square - fitted.chi_square
-    is_linear = error <= DECISIVE * max(fitted.chi_square / fitted.count, 1.0)
+    is_linear = error <= DECISIVE * discount(fitted.chi_square, fitted.count)
     return response if is_linear else LinearResponse(fitted.linearised_at_end())
 
 
@@ -337,8 +330,8 @@ def promising_guesses(response: LinearResponse, forms: list[CandidateForm], comp
     """
 
     def least(form: CandidateForm) -> float:
-        penalty = _parameter_count(form) * np.log(response.objective.count) + prior_deviance(competing.of(form))
-        return ESTIMATE_SHARE * (DECISIVE + float(penalty))
+        needed = DECISIVE + float(penalty(_parameter_count(form), response.objective.count, competing.of(form)))
+        return ESTIMATE_SHARE * needed
 
     lines: list[tuple[float, Guess]] = []
     for form, grid, gains in _spectra(response, [form for form in forms if len(form.model.phases) > 1], COARSE):

@@ -29,14 +29,12 @@ from otolith.discovery.hypotheses import (
     is_possible,
     largest_chi_square,
     nothing_happened,
-    residual_variance_factor,
     with_candidate,
     with_components,
 )
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.noise_hypothesis import changing_commands, noisier_signals
 from otolith.discovery.screening import (
-    DECISIVE,
     CompetingForms,
     ScoredGuesses,
     ScreeningResult,
@@ -44,6 +42,7 @@ from otolith.discovery.screening import (
     linearised,
     screen_fit,
 )
+from otolith.estimation.evidence import DECISIVE, discount
 from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
@@ -132,10 +131,10 @@ def _threshold_gain(response: LinearResponse) -> float:
     best = -np.inf
     for fitted in fit_hypotheses(proposals, response.window):
         count = fitted.fit.count
-        variance_factor = residual_variance_factor([fitted.chi_square], count)
+        divisor = discount(fitted.chi_square, count)
         # The initial prior leaves all parameters free, so that the penalty counts them beside those of the component.
-        penalty = fitted.deviance(count, 1.0) - fitted.chi_square + len(problem.free) * np.log(count)
-        best = max(best, (response.chi_square - fitted.chi_square) / variance_factor - penalty)
+        stated = replace(fitted.hypothesis, added=fitted.hypothesis.added + len(problem.free))
+        best = max(best, (response.chi_square - fitted.chi_square) / divisor - stated.penalty(count))
     return best
 
 
@@ -292,9 +291,9 @@ def _chi_square(fitted: FittedHypothesis) -> float:
 def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
     """Return the best hypothesis if it explains the window decisively, with at most one component added."""
     null, count = fitted[0], fitted[0].fit.count
-    variance_factor = residual_variance_factor(map(_chi_square, fitted), count)
-    best = min(fitted, key=lambda item: item.deviance(count, variance_factor))
-    gain = null.deviance(count, variance_factor) - best.deviance(count, variance_factor)
+    divisor = discount(min(map(_chi_square, fitted)), count)
+    best = min(fitted, key=lambda item: item.evidence(count, divisor).deviance)
+    gain = null.evidence(count, divisor).over(best.evidence(count, divisor))
     added = len(best.problem.components) - len(null.problem.components)
     return best if gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count else None
 
@@ -351,7 +350,7 @@ def _several_moved(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
         named = [row for row in _would_explain_most(best.problem, response) if row[0] not in best.name.split(", ")]
         proposals = [_moved(best.problem, best.fit.prior, label, number, best) for label, number in named]
         further = min(fit_hypotheses(proposals, best.fit.window, FAR_WORSE), key=_chi_square, default=None)
-        if further is None or best.deviance(count, 1.0) - further.deviance(count, 1.0) <= DECISIVE:
+        if further is None or best.evidence(count, 1.0).over(further.evidence(count, 1.0)) <= DECISIVE:
             break
         more.append(further)
         best = further
@@ -371,13 +370,13 @@ def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
     count = best.fit.count
     further = min(
         _possible(fit_hypotheses(proposals, window, FAR_WORSE)),
-        key=lambda item: item.deviance(count, 1.0),
+        key=lambda item: item.evidence(count, 1.0).deviance,
         default=None,
     )
     if further is None:
         return None
-    gain = best.deviance(count, 1.0) - further.deviance(count, 1.0)
-    return further if gain / residual_variance_factor([further.chi_square], count) > DECISIVE else None
+    gain = best.evidence(count, 1.0).over(further.evidence(count, 1.0))
+    return further if gain / discount(further.chi_square, count) > DECISIVE else None
 
 
 def _sub_structures(whole: FittedHypothesis, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:

@@ -28,13 +28,13 @@ from otolith.discovery.hypotheses import (
     complexity_penalty,
     evidence_factor,
     prune,
-    residual_variance_factor,
     track,
     without_insignificant,
 )
 from otolith.discovery.noise_hypothesis import is_white, normalisation
-from otolith.discovery.screening import DECISIVE, ScreeningResult
+from otolith.discovery.screening import ScreeningResult
 from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
+from otolith.estimation.evidence import DECISIVE, NO_EVIDENCE, LogEvidence, discount, likelihood_ratios
 from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
@@ -55,20 +55,11 @@ ALWAYS_TRACKED = (FaultType.NOTHING, FaultType.PARAMETER)
 
 
 @dataclass(frozen=True, slots=True)
-class FitSummary:
-    """How well the best hypothesis explains a window."""
-
-    chi_square: float = 0.0
-    penalty: float = 0.0  # Of its complexity, in -2 log evidence
-    variance_factor: float = 1.0  # By what evidence is divided
-
-
-@dataclass(frozen=True, slots=True)
 class FilterEvidence:
     """Evidence for and against the filter, which has not learned from the window that opened the test.
 
     That window may itself have been wrong. So only those after it count, each by the difference that it makes between
-    the filter and the best hypothesis, Δ = (χ² of the filter - χ² of the best) / variance factor::
+    the filter and the best hypothesis, Δ = (χ² of the filter - χ² of the best) / discount::
 
         deviance ← deviance + Δ                  -2 log likelihood of the filter, relative to the best hypothesis
         cusum    ← cusum + Δ - DECISIVE          cumulative sum: it falls in windows that give less
@@ -79,9 +70,9 @@ class FilterEvidence:
     deviance: float = 0.0
     cusum: float = -MAX_WINDOW_EVIDENCE  # below zero: it must exceed the complexity penalty of a hypothesis as well
 
-    def after(self, chi_square: float, best: FitSummary) -> "FilterEvidence":
+    def after(self, chi_square: float, best: LogEvidence) -> "FilterEvidence":
         """Return the evidence after a window, of which the filter leaves ``chi_square``."""
-        more = (chi_square - best.chi_square) / best.variance_factor
+        more = LogEvidence(chi_square, best.penalty).over(best)
         deviance = self.deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         cusum = self.cusum + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         return FilterEvidence(
@@ -138,7 +129,7 @@ class SequentialTest:
     problem: Problem  # Of the filter, without what the hypotheses add
     hypotheses: tuple[TrackedHypothesis, ...]  # The best first
     onset: float  # Service time, s
-    last: FitSummary = FitSummary()  # Of the last window
+    last: LogEvidence = NO_EVIDENCE  # Of the last window, for the best hypothesis
     counts: WindowCounts = WindowCounts()
     filter_evidence: FilterEvidence = FilterEvidence()
     null_reduced_chi_square: float = 1.0
@@ -252,24 +243,24 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
     null = fitted[0]
     fitted = [null, *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
     count = null.fit.count
-    variance_factor = evidence_factor(fitted)
-    deviances = {item: item.deviance(count, variance_factor) for item in fitted}
-    ordered = sorted(fitted, key=lambda item: deviances[item])
-    best = ordered[0]
-    least, least_chi_square = deviances[best], min(item.chi_square for item in fitted)
-    kept = [item for item in ordered if deviances[item] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
+    divisor = evidence_factor(fitted)
+    evidence = {item: item.evidence(count, divisor) for item in fitted}
+    ordered = sorted(fitted, key=lambda item: evidence[item].deviance)
+    best, least_misfit = ordered[0], min(own.misfit for own in evidence.values())
+    least = evidence[best].deviance
+    kept = [item for item in ordered if evidence[item].deviance <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
     kept += [item for item in ordered if item.type in ALWAYS_TRACKED and item not in kept]
     tracked = []
     for item in kept:
-        deviance = min(deviances[item] - least, MAX_FIRST_EVIDENCE)
-        misfit = min((item.chi_square - least_chi_square) / variance_factor, MAX_FIRST_EVIDENCE)
+        deviance = min(evidence[item].deviance - least, MAX_FIRST_EVIDENCE)
+        misfit = min(evidence[item].misfit - least_misfit, MAX_FIRST_EVIDENCE)
         tracked.append(track(item, predicted, deviance, misfit))
     return SequentialTest(
         predicted.problem,
         _sorted([item for item in tracked if item is not None]),
         best.fit.window.start,
-        last=FitSummary(best.chi_square, least - best.chi_square / variance_factor, variance_factor),
-        null_reduced_chi_square=max(null.chi_square / max(count, 1.0), 1.0),
+        last=evidence[best],
+        null_reduced_chi_square=discount(null.chi_square, count),
         has_explained_unexpected=best.fit.cost <= EXPLAINED,
     )
 
@@ -280,7 +271,8 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     steps = [step for step in _steps(test, window) if step.is_usable]
     if not steps:
         return test
-    steps, last = _with_deviances(steps)
+    steps = _with_evidence(steps)
+    last = min((step.log_evidence for step in steps), key=lambda own: own.deviance)
     tracked, deviances = _updated(steps)
     if not tracked:
         return test
@@ -297,14 +289,16 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
 
 def _updated(steps: Sequence[HypothesisStep]) -> tuple[list[TrackedHypothesis], list[float]]:
     """Return the hypotheses after a window, without those that it excludes, and their deviances in it."""
-    least, least_misfit = min(step.deviance for step in steps), min(step.misfit for step in steps)
+    least = min(step.log_evidence.deviance for step in steps)
+    least_misfit = min(step.log_evidence.misfit for step in steps)
     tracked, deviances = [], []
     for step in steps:
-        deviance = min(step.deviance - least, MAX_WINDOW_EVIDENCE)
-        item = step.updated(deviance, min(step.misfit - least_misfit, MAX_WINDOW_EVIDENCE))
+        own = step.log_evidence
+        deviance = min(own.deviance - least, MAX_WINDOW_EVIDENCE)
+        item = step.updated(deviance, min(own.misfit - least_misfit, MAX_WINDOW_EVIDENCE))
         if item is not None:
             tracked.append(item)
-            deviances.append(step.deviance)
+            deviances.append(own.deviance)
     return tracked, deviances
 
 
@@ -340,20 +334,14 @@ def _with_noise(steps: list[HypothesisStep]) -> list[HypothesisStep]:
     return kept
 
 
-def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], FitSummary]:
-    """Return the steps with their deviances, and a summary of the best."""
-    variance_factor = residual_variance_factor([item.fitted.unexplained for item in steps], steps[0].fitted.fit.count)
-    steps = [
-        replace(
-            step,
-            deviance=step.fitted.chi_square / variance_factor + complexity_penalty(step.predicted, step.evidence),
-            misfit=step.fitted.chi_square / variance_factor,
-        )
-        for step in steps
+def _with_evidence(steps: list[HypothesisStep]) -> list[HypothesisStep]:
+    """Return the steps with the evidence of the window."""
+    divisor = discount(min(step.fitted.unexplained for step in steps), steps[0].fitted.fit.count)
+    penalties = (complexity_penalty(step.predicted, step.evidence) for step in steps)
+    return [
+        replace(step, log_evidence=LogEvidence(step.fitted.chi_square, penalty, divisor))
+        for step, penalty in zip(steps, penalties, strict=True)
     ]
-    best = min(steps, key=lambda step: step.deviance)
-    chi_square = best.fitted.chi_square
-    return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, variance_factor)
 
 
 def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisStep]) -> tuple[TrackedHypothesis, ...]:
@@ -373,8 +361,7 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
 
     If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
     """
-    old, new = test.last, fresh.last
-    gain = (old.chi_square - new.chi_square) / new.variance_factor + old.penalty - new.penalty  # of the window alone
+    gain = test.last.over(fresh.last)  # of the window alone
     if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
         return fresh
     if gain <= DECISIVE:
@@ -451,11 +438,11 @@ def _place(item: TrackedHypothesis, simplest: TrackedHypothesis | None) -> tuple
 
 def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:
     """Return the probability of each hypothesis; ``groups`` of interchangeable ones are equally probable."""
-    logs = -0.5 * np.array([item.deviance for item in hypotheses])
-    totals = [float(np.logaddexp.reduce(logs[list(group)])) for group in groups]
+    deviances = np.array([item.deviance for item in hypotheses])
+    totals = [-2.0 * float(np.logaddexp.reduce(-0.5 * deviances[list(group)])) for group in groups]
     for group, total in zip(groups, totals, strict=True):
-        logs[list(group)] += max(totals) - total
-    weights = np.exp(logs - logs.max())
+        deviances[list(group)] += min(totals) - total
+    weights = likelihood_ratios(deviances)
     shares: list[float] = (weights / weights.sum()).tolist()
     return shares
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
+from otolith.estimation.evidence import likelihood_ratios, log_determinant
 from otolith.estimation.information import Evidence
 
 TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
@@ -267,8 +268,7 @@ def update(innovation: Innovation) -> ImmPosterior:
     kept = np.eye(prediction.mean.shape[1]) - gain @ root  # Joseph form
     covariance = kept @ prediction.covariance @ kept.transpose(0, 2, 1) + gain @ gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    log_likelihood = -0.5 * (innovation.nis_of_mode + np.linalg.slogdet(innovation.covariance)[1])
-    weight = prediction.weight * np.exp(log_likelihood - log_likelihood.max())
+    weight = prediction.weight * likelihood_ratios(innovation.nis_of_mode + log_determinant(innovation.covariance))
     weight = np.maximum(weight / weight.sum(), MIN_MODE_WEIGHT)
     ratio = _updated_ratio(prediction.variance_ratio, innovation.nis / len(root))
     return _recentre(ImmPosterior(prediction.level, mean, covariance, weight / weight.sum(), prediction.end, ratio))

@@ -128,6 +128,11 @@ class Objective:
         return self.innovation_model.whitening
 
     @property
+    def spread(self) -> float:
+        """Sum over the records of ln|covariance of the innovations|, before they are whitened."""
+        return self.innovation_model.log_determinant
+
+    @property
     def integrator_steps(self) -> int:
         """Steps of the integrator in one prediction."""
         return int(self.excitation.counts.sum())

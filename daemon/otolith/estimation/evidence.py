@@ -1,0 +1,82 @@
+"""The evidence of a window for one alternative: the one definition of -2 log p(window | alternative).
+
+Around a point, the whitened residuals of a window are r = J z + e. The errors e are independent with unit variance, and
+of the values z (parameters, trends, initial state, amplitudes of components) a normal distribution with the covariance
+P is known beforehand. Integrated over z, up to a constant that all alternatives share::
+
+    -2 log p  =  min over z of (|r - J z|² + zᵀ P⁻¹ z)  +  ln|S|  +  ln|I + J P Jᵀ|
+                 χ², of window and prior                     spread     complexity
+
+S is the covariance of the innovations before they were whitened. Where nothing is known of k values, n measured ones
+make the complexity k ln n (Bayesian information criterion: G. Schwarz, Annals of Statistics 6, 1978).
+
+Where even the best alternative leaves more than the noise, what it leaves is no independent evidence for any of them:
+χ² is divided by the *discount*. ``docs/explanation/evidence.md`` says where it is which.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+
+# Thresholds: docs/reference/thresholds-estimation.md has the origin of each.
+DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
+
+
+@dataclass(frozen=True, slots=True)
+class LogEvidence:
+    """-2 log evidence of a window for one alternative, by its terms."""
+
+    chi_square: float = 0.0  # Least χ² of window and prior, with ln|S| where alternatives differ in it
+    penalty: float = 0.0  # Of the complexity, and of the prior odds
+    discount: float = 1.0  # What χ² is divided by
+
+    @property
+    def misfit(self) -> float:
+        """The part of the data alone: without complexity and prior odds."""
+        return self.chi_square / self.discount
+
+    @property
+    def deviance(self) -> float:
+        """-2 log evidence."""
+        return self.misfit + self.penalty
+
+    def over(self, other: "LogEvidence") -> float:
+        """Return by how much the deviance exceeds that of ``other``, whose discount counts for both."""
+        return (self.chi_square - other.chi_square) / other.discount + self.penalty - other.penalty
+
+
+NO_EVIDENCE = LogEvidence()  # of no window
+
+
+def discount(chi_square: float, count: float) -> float:
+    """Return what evidence is divided by where the best alternative leaves ``chi_square`` of ``count`` values.
+
+    That is how many times the variance of the noise it leaves; at least one.
+    """
+    return max(chi_square / count, 1.0)
+
+
+def log_determinant(covariance: Array) -> Array:
+    """Return ln|I + M| (...,) of covariances I + M (..., n, n): of innovations, or of a window seen from a prior.
+
+    With M = R P Rᵀ and RᵀR = JᵀJ this is the complexity of what is estimated; with M = Lᵀ JᵀJ L and L Lᵀ = P as well.
+    """
+    return np.asarray(np.linalg.slogdet(covariance)[1])
+
+
+def prior_deviance(alternatives: float | Array) -> Array:
+    """Return -2 log of the prior odds of one of so many hypotheses of a type against the null hypothesis."""
+    return np.asarray(2.0 * np.log(NULL_ODDS * alternatives))
+
+
+def penalty(values: float | Array, count: float, alternatives: float | Array) -> Array:
+    """Return the penalty of ``values`` of which nothing was known, from ``count`` measured ones, and of prior odds."""
+    return np.asarray(values * np.log(count) + prior_deviance(alternatives))
+
+
+def likelihood_ratios(deviances: Array) -> Array:
+    """Return the likelihood of each alternative over that of the likeliest one."""
+    return np.asarray(np.exp(-0.5 * (deviances - deviances.min())))
