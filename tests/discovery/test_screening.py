@@ -24,8 +24,7 @@ from otolith.discovery.screening import (
     inner_grid,
     screen_window,
 )
-from otolith.estimation.evidence import DECISIVE
-from otolith.estimation.objective import EXPLAINED
+from otolith.estimation.evidence import DECISIVE, EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate_window

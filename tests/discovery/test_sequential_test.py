@@ -90,7 +90,7 @@ def test_what_opened_a_test_has_ended_where_the_filter_alone_explains_a_window(e
     """Otherwise new hypotheses would compete with the filter as it was while the fault lasted."""
     null, moved = hypothesis(FaultType.NOTHING, BARE), hypothesis(FaultType.PARAMETER, BARE)
     wrong = hypothesis(FaultType.SENSOR, augment(BARE, [PERIODIC]))
-    wrong = replace(wrong, cost=5.0)
+    wrong = replace(wrong, cost=5.0, is_explained=False)
     old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, LogEvidence(9000.0), WindowCounts(tested=15))
     others = (null, moved.worse_by(5.0, 0.0)) if ended else (moved, null.worse_by(15.0, 15.0))
     fresh = SequentialTest(BARE, others, 30.0, LogEvidence(400.0))

@@ -40,7 +40,6 @@ from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
 from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
 from otolith.estimation.imm_filter import Innovation, ParameterCusum
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
 from otolith.estimation.timing import with_changes_between
@@ -107,7 +106,7 @@ class _TestedEstimate:
     @property
     def is_expected(self) -> bool:
         """Whether the twin explains the window, and its prediction agrees with it."""
-        return self.estimated.cost <= EXPLAINED and self.innovation.is_expected
+        return self.estimated.is_explained and self.innovation.is_expected
 
 
 def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
@@ -250,7 +249,7 @@ def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: Window
     """Return the result of a window; if the twin explains it, it is searched together with those before."""
     fitted = tested.estimated.fit
     is_undecided = result.decision is not WindowDecision.LEARNED or result.test is not None
-    if is_undecided or fitted.cost > EXPLAINED or tested.estimated.drifts:
+    if is_undecided or not fitted.is_explained or tested.estimated.drifts:
         return result
     pooled = state.pooled.after(fitted, result.after.mean[: len(fitted.problem.free)])
     if pooled.confirmed is None:
@@ -312,7 +311,8 @@ def _without_faded(state: AdaptationState, result: WindowResult, estimated: Wind
     if slot is None:
         return result
     fewer = _replace_posterior(WindowDecision.FADED, result.posterior.without_slot(slot), estimated, adopted)
-    is_needed = fewer.estimate is None or fewer.estimate.cost > max(EXPLAINED, estimated.cost)
+    without = fewer.estimate
+    is_needed = without is None or not (without.is_explained or without.cost <= estimated.cost)
     return result if is_needed else fewer
 
 
@@ -390,6 +390,6 @@ def _next_records(state: AdaptationState, result: WindowResult) -> int:
     free, window = len(problem.free), estimated.fit.window
     trend: Array = np.sqrt(known.mean[free:] ** 2 + np.diag(known.covariance)[free:])
     sd = np.array([parameter.sd for parameter in estimated.parameters])
-    excitation = WindowExcitation(sd, trend, estimated.cost <= EXPLAINED)
+    excitation = WindowExcitation(sd, trend, estimated.is_explained)
     period = window.grid.period or problem.window.sample_period or window.sample_period
     return next_records(problem.window, window.grid.length, period, excitation)

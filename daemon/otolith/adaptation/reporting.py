@@ -36,7 +36,6 @@ from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE, Prior
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of, wrapped
 from otolith.estimation.window_fit import WindowEstimate
@@ -237,7 +236,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
         reasons.append(decision.in_words)
     if test is not None and result.is_mixture:
         reasons.append(_hypotheses_text(test))
-    if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
+    if not result.estimate.is_explained and decision is not WindowDecision.REFUSED:
         reasons.append(UNEXPLAINED)
     variance_ratio = result.posterior.belief.variance_ratio
     if variance_ratio > DISAGREEING_RATIO:
@@ -274,7 +273,7 @@ def _fit_and_cost(problem: Problem, result: WindowResult) -> dict[str, FitDocume
         rmse_configured=_finite(outputs, estimated.rmse_configured),
         rmse_estimated=_finite(outputs, estimated.rmse_estimated),
         rmse_completed=completed,
-        explained=estimated.cost <= EXPLAINED,
+        explained=estimated.is_explained,
         cost=estimated.cost,
         variance_ratio=result.posterior.belief.variance_ratio,
         outcome=estimated.outcome,

@@ -231,7 +231,7 @@ def outlyingness(fits: Fits, index: int, width: Array) -> float:
     free = fit.objective.free
     deviate = _normal_deviate(fit.result.chi_square, int(fit.objective.count))
     # Without the reduction by large residuals, which would make a misfit look uncertain instead of improbable.
-    own = sqrt_information(fit, width) * max(fit.cost, 1.0)
+    own = sqrt_information(fit, width) * np.sqrt(fit.discount)
     roots = [sqrt_information(other, width) for other in others]
     stacked = np.vstack(roots)
     if not len(own) or not len(stacked):
@@ -259,7 +259,7 @@ def sqrt_information(fit: FittedWindow, width: Array) -> Array:
     free = fit.objective.free
     scaled = fit.result.jacobian * width
     _, singular, directions = np.linalg.svd(eliminate_states(scaled[:, :free], scaled[:, free:]), full_matrices=False)
-    singular = singular / max(fit.cost, 1.0)
+    singular = singular / np.sqrt(fit.discount)
     determined = singular > MIN_INFORMATION
     return np.asarray(singular[determined, None] * directions[determined])
 

@@ -250,8 +250,8 @@ class _Search:
         for fit in point.fits:
             response = delay_response(fit.objective, fit.guess)[:, list(signals)]
             left = self._likelihood.project(response, fit.result.jacobian)
-            scores.append(left.T @ fit.result.residuals / max(fit.cost, 1.0) ** 2)
-            information.append(left.T @ response / max(fit.cost, 1.0) ** 2)
+            scores.append(left.T @ fit.result.residuals / fit.discount)
+            information.append(left.T @ response / fit.discount)
         total = np.sum(information, axis=0)
         covariance = np.linalg.pinv(total, hermitian=True)
         step = -covariance @ np.sum(scores, axis=0)

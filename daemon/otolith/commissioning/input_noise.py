@@ -20,7 +20,6 @@ from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.minimisers import continued
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.window_fit import ALONE_STEPS, Fit
 from otolith.twin.definition import Input
 
@@ -119,7 +118,7 @@ class InputNoiseSums:
         objective = fitted.objective
         alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
         own = FittedWindow(window, objective, alone.guess, alone)
-        if own.cost > EXPLAINED:
+        if not own.is_explained:
             return self
         random = np.random.default_rng((fitted.problem.seed, window.index))
         sums = self.sums or (Correlation(),) * len(bounds)
@@ -166,7 +165,7 @@ def _correlation(fit: FittedWindow, name: str, level: float, draws: int, random:
     for noise in level * random.standard_normal((draws, window.records)):
         moved = response(noise)
         expected += float((moved - basis @ (basis.T @ moved)) @ response(_fast(window, noise)))
-    observed, variance = float(fit.result.residuals @ fast), max(fit.cost, 1.0) ** 2 * power
+    observed, variance = float(fit.result.residuals @ fast), fit.discount * power
     own = Correlation(observed, expected / draws / level**2, variance, level, 1)
     return own if np.isfinite(expected) else Correlation()
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.evidence import LogEvidence, log_determinant
+from otolith.estimation.evidence import LogEvidence, discount, is_explained, log_determinant
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -54,6 +54,16 @@ class FittedWindow:
     def cost(self) -> float:
         """Root mean square of the whitened innovations: 1 if the noise levels are right."""
         return float(np.sqrt(self.result.chi_square / self.objective.count))
+
+    @property
+    def discount(self) -> float:
+        """Factor on the variance of the noise for a residual larger than that; at least one."""
+        return discount(self.result.chi_square, self.objective.count)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the fit leaves nothing but noise."""
+        return is_explained(self.result.chi_square, self.objective.count)
 
 
 Fits = Sequence[FittedWindow]

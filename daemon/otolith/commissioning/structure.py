@@ -36,7 +36,6 @@ from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import initial_prior, orthonormal_basis
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
 from otolith.estimation.window_fit import Fit, fit
@@ -264,7 +263,7 @@ def remaining_structure(
         progress(f"structure of window {len(fits) + 1}")
         starts = [problem.nominal, *(one.guess[: len(problem.free)] for one in fits[-1:])]
         fits.append(likelihood.fit(levels, window, starts))
-    parts = regimes([one for one in fits if one.cost <= EXPLAINED], noise.changes)
+    parts = regimes([one for one in fits if one.is_explained], noise.changes)
     inner = [part[at > 0 : len(part) - (at < len(parts) - 1)] for at, part in enumerate(parts)]
     fits = max(inner, key=len, default=[])
     if len(fits) < MIN_WINDOWS:

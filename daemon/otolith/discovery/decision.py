@@ -10,7 +10,6 @@ from enum import Enum, StrEnum
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
 from otolith.estimation.evidence import DECISIVE
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, indices, site_of, slot_of
 
@@ -122,8 +121,8 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
-    if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
+    # If it leaves structure, the cause may be none of the hypotheses.
+    if not best.leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
         return fault if _is_plausible(fault.hypothesis) else WindowOutcome(WindowDecision.SUSPECTED, fault.hypothesis)
     if _is_component_accepted(test) and (chosen := _without_undecided_terms(test)).type is FaultType.COMPONENT:
         return WindowOutcome(WindowDecision.DISCOVERED if _is_plausible(chosen) else WindowDecision.SUSPECTED, chosen)
@@ -179,7 +178,7 @@ def _all_moved(test: SequentialTest) -> TrackedHypothesis | None:
             item
             for item in test.hypotheses
             if item.type is FaultType.PARAMETER and item.hypothesis.added == free == len(item.problem.free)
-            if item.misfit <= DECISIVE and item.cost <= EXPLAINED
+            if item.misfit <= DECISIVE and item.is_explained
         ),
         None,
     )

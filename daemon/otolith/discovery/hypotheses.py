@@ -15,6 +15,7 @@ from otolith.discovery.candidates import Candidate
 from otolith.estimation.evidence import (
     DECISIVE,
     NO_EVIDENCE,
+    STRUCTURE,
     LogEvidence,
     discount,
     log_determinant,
@@ -206,6 +207,7 @@ class TrackedHypothesis:
     delay_sds: tuple[float, ...] = ()  # Standard deviation, in s, of the delay with which each window was fitted
     shift_by_delay: tuple[tuple[str, float], ...] = ()
     """How far the parameters of each label move with that delay, per second; empty if it states none."""
+    is_explained: bool = True  # Whether it leaves no more than noise of the last window
     leaves_only_noise: bool = True  # Whether the screening test found nothing in what it left of the last window
 
     @property
@@ -217,6 +219,11 @@ class TrackedHypothesis:
     def problem(self) -> Problem:
         """The problem with what the hypothesis adds."""
         return self.posterior.problem
+
+    @property
+    def leaves_structure(self) -> bool:
+        """Whether what it leaves of the last window is more than noise: then the cause may be another."""
+        return self.inflation > STRUCTURE
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -266,7 +273,7 @@ class HypothesisStep:
         """
         posterior = self.predicted.update(self.predicted.innovation(self.evidence), self.fitted.fit.advance())
         own = self.fitted.fit
-        tracked = replace(self.tracked, posterior=posterior, cost=own.cost, inflation=own.inflation)
+        tracked = _with_window(replace(self.tracked, posterior=posterior), own)
         tracked = tracked.worse_by(deviance, misfit)
         if self.tracked.type is FaultType.COMPONENT and not is_possible(posterior.problem, posterior.prior().mean):
             return None
@@ -291,9 +298,14 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfi
     if not is_usable(fitted.hypothesis, own, evidence):
         return None
     posterior = own.update(own.innovation(evidence), fitted.fit.advance())
-    left = fitted.fit.cost, fitted.fit.inflation
-    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, *left)
+    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, fitted.fit.cost)
+    tracked = _with_window(tracked, fitted.fit)
     return tracked if fitted.type is not FaultType.TIMING else _with_delay(tracked, fitted.fit)
+
+
+def _with_window(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis:
+    """Return the hypothesis with what it leaves of its last window."""
+    return replace(tracked, cost=fitted.cost, inflation=fitted.inflation, is_explained=fitted.is_explained)
 
 
 def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | None:
@@ -346,7 +358,7 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
         return DelayScore(0.0, 0.0, (0.0,) * (2 * free))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     shift = -np.linalg.lstsq(jacobian / scale, response, rcond=None)[0] / scale
-    step, information = -float(projected @ residuals) / size, size / max(fitted.cost, 1.0) ** 2
+    step, information = -float(projected @ residuals) / size, size / fitted.discount
     return DelayScore(step, information, tuple(shift[: 2 * free].tolist()))
 
 

@@ -18,7 +18,6 @@ from otolith.discovery.linear_response import LinearResponse, chi_square_of_para
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
 from otolith.estimation.evidence import DECISIVE, LogEvidence
 from otolith.estimation.information import information
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
 
@@ -44,7 +43,7 @@ def noisier_signals(null: FittedHypothesis, least: float) -> list[FittedHypothes
     There is none if it would be far less likely than the other hypotheses, of which the best leaves χ² of ``least``.
     """
     max_deviance, around = largest_chi_square(least, null.fit.count), null.fit
-    for _ in range(1 + ROUNDS if null.fit.cost > EXPLAINED else 1):  # far from the null, levels are those of its errors
+    for _ in range(1 if null.fit.is_explained else 1 + ROUNDS):  # far from the null, levels are those of its errors
         best = _at_larger_levels(around, null.fit, max_deviance)
         if best is None:
             return []
@@ -215,7 +214,7 @@ def likelier_levels_of(fitted: Fit) -> Problem:
     Process noise that is stated too large for that of the sensors makes the predictor follow every sample. The gain of
     a sensor would change how far it follows, and would pass for a cause.
     """
-    if fitted.cost > EXPLAINED:
+    if not fitted.is_explained:
         return fitted.problem
     likely = _backward_elimination(
         fitted.linearised_at_end(), np.zeros(len(fitted.problem.levels), dtype=np.bool_)

@@ -42,9 +42,9 @@ from otolith.discovery.screening import (
     linearised,
     screen_fit,
 )
-from otolith.estimation.evidence import DECISIVE, discount
+from otolith.estimation.evidence import DECISIVE, discount, is_explained
 from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
-from otolith.estimation.objective import EXPLAINED, Objective
+from otolith.estimation.objective import Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, indices
 from otolith.estimation.timing import delayable, largest_delay, trial_delays
@@ -202,9 +202,9 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
     With a component, a fit may reach another minimum. The component needs evidence against the parameters alone there.
     """
     best = min(fitted, key=_chi_square)
-    if best.type is FaultType.PARAMETER or best.fit.cost > EXPLAINED:
+    if best.type is FaultType.PARAMETER or not best.fit.is_explained:
         return fitted
-    unexplained = [item for item in fitted if item.type is FaultType.PARAMETER and item.fit.cost > EXPLAINED]
+    unexplained = [item for item in fitted if item.type is FaultType.PARAMETER and not item.fit.is_explained]
     again = fit_hypotheses((_instead_of_components(item, best.fit) for item in unexplained), fitted[0].fit.window)
     refitted = dict(zip(unexplained, again, strict=True))
     return [min(item, refitted.get(item, item), key=_chi_square) for item in fitted]
@@ -295,7 +295,7 @@ def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
     best = min(fitted, key=lambda item: item.evidence(count, divisor).deviance)
     gain = null.evidence(count, divisor).over(best.evidence(count, divisor))
     added = len(best.problem.components) - len(null.problem.components)
-    return best if gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count else None
+    return best if gain > DECISIVE and added <= 1 and is_explained(best.chi_square, count) else None
 
 
 def _would_explain_most(problem: Problem, response: LinearResponse) -> list[tuple[str, int]]:
@@ -345,7 +345,7 @@ def _several_moved(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
     single = [item for item in fitted if item.type is FaultType.PARAMETER and item.hypothesis.added == 1]
     count = fitted[0].fit.count
     best, more = min(single, key=_chi_square, default=None), list[FittedHypothesis]()
-    while best is not None and best.fit.cost > EXPLAINED and best.hypothesis.added < MAX_MOVED:
+    while best is not None and not best.fit.is_explained and best.hypothesis.added < MAX_MOVED:
         response = LinearResponse(best.fit.linearised_at_end())
         named = [row for row in _would_explain_most(best.problem, response) if row[0] not in best.name.split(", ")]
         proposals = [_moved(best.problem, best.fit.prior, label, number, best) for label, number in named]

@@ -36,7 +36,6 @@ from otolith.discovery.screening import ScreeningResult
 from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
 from otolith.estimation.evidence import DECISIVE, NO_EVIDENCE, LogEvidence, discount, likelihood_ratios
 from otolith.estimation.information import QUANTILE, Prior
-from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit
@@ -113,7 +112,7 @@ class WindowCounts:
     def after(self, before: TrackedHypothesis, best: TrackedHypothesis, *, is_resolved: bool) -> "WindowCounts":
         """Return the counts after a tested window, by the best hypothesis ``before`` it and the ``best`` one now."""
         is_same = best.hypothesis.name == before.hypothesis.name
-        leaves_structure = best.type is FaultType.COMPONENT and best.inflation > EXPLAINED
+        leaves_structure = best.type is FaultType.COMPONENT and best.leaves_structure
         return replace(
             self,
             leading=(0 if leaves_structure else self.leading + 1) if is_same else 1,
@@ -166,7 +165,7 @@ class SequentialTest:
     @property
     def explains_window(self) -> bool:
         """Whether the best hypothesis explains the last window up to the noise."""
-        return self.best.cost <= EXPLAINED
+        return self.best.is_explained
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -261,7 +260,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         best.fit.window.start,
         last=evidence[best],
         null_reduced_chi_square=discount(null.chi_square, count),
-        has_explained_unexpected=best.fit.cost <= EXPLAINED,
+        has_explained_unexpected=best.fit.is_explained,
     )
 
 
@@ -307,7 +306,9 @@ def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
     predicted = [item.posterior.predict(window) for item in test.hypotheses]
     proposals = [_continued(item, posterior) for item, posterior in zip(test.hypotheses, predicted, strict=True)]
     fitted = [
-        explained_again(own, proposal, window, item.posterior) if own.fit.cost > EXPLAINED >= item.cost else own
+        explained_again(own, proposal, window, item.posterior)
+        if item.is_explained and not own.fit.is_explained
+        else own
         for own, proposal, item in zip(fit_hypotheses(proposals, window), proposals, test.hypotheses, strict=True)
     ]
     rows = list(zip(test.hypotheses, predicted, fitted, strict=True))
@@ -362,7 +363,7 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
     """
     gain = test.last.over(fresh.last)  # of the window alone
-    if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
+    if fresh.best.type is FaultType.NOTHING and fresh.best.is_explained and not test.best.is_explained:
         return fresh
     if gain <= DECISIVE:
         return test

@@ -28,7 +28,7 @@ from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.estimation.imm_filter import NIS_DEVIATE, nis_limit
-from otolith.estimation.objective import EXPLAINED, MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
+from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import fit_predicted
@@ -292,7 +292,7 @@ def _without_piles(channel: _Channel) -> tuple[Window, FaultySensor] | None:
     if len(piled) in (0, len(channel.present)):  # a steady sensor shows no limit
         return None
     others = fit_predicted(channel.predicted, problem, channel.without(piled))
-    if not others.cost <= EXPLAINED:
+    if not others.is_explained:
         return None
     prediction, least = others.predict()[0][:, channel.index], FROZEN_MOVEMENT * noise
     runs = [
@@ -415,7 +415,7 @@ def _is_probable(channel: _Channel, problem: Problem, reduced: Window, rounding:
     if not others.chi_square < PENALTY:
         return True  # a twin that diverges predicts nothing
     unknowns = len(problem.free) + len(problem.twin.states)
-    limit = others.chi_square + max(others.cost, 1.0) ** 2 * (nis_limit(unknowns) + rounding)
+    limit = others.chi_square + others.discount * (nis_limit(unknowns) + rounding)
     starts = (others.parameters, predicted.start())  # either may lead into a local minimum
     chi_squares = (fit_predicted(predicted, problem, channel.window, start).chi_square for start in starts)
     return any(chi_square <= limit or not chi_square < PENALTY for chi_square in chi_squares)

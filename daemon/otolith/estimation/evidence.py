@@ -22,6 +22,8 @@ from otolith.acquisition.window import Array
 
 # Thresholds: docs/reference/thresholds-estimation.md has the origin of each.
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+EXPLAINED = 1.5  # RMSE in units of the noise up to which a residual counts as noise
+STRUCTURE = 1.5  # the same with the correlation of what is left: above it, there is more than noise
 NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 
 
@@ -57,6 +59,11 @@ def discount(chi_square: float, count: float) -> float:
     That is how many times the variance of the noise it leaves; at least one.
     """
     return max(chi_square / count, 1.0)
+
+
+def is_explained(chi_square: float, count: float) -> bool:
+    """Whether ``chi_square`` of ``count`` measured values is what noise leaves."""
+    return chi_square <= EXPLAINED**2 * count
 
 
 def log_determinant(covariance: Array) -> Array:

@@ -14,8 +14,9 @@ from functools import partial
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
+from otolith.estimation.evidence import is_explained
 from otolith.estimation.minimisers import FitResult, gauss_newton, latin_hypercube, minimise
-from otolith.estimation.objective import EXPLAINED, Objective
+from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import StateVariable
 
@@ -128,7 +129,7 @@ def _further_round(
         parameters=polished.guess[: len(start)],
         initial=polished.guess[len(start) :],
         chi_square=polished.chi_square,
-        is_explained=polished.chi_square <= EXPLAINED**2 * objective.count,
+        is_explained=is_explained(polished.chi_square, objective.count),
         generations=found.generations,
         evaluations=found.evaluations + evaluations,
         integrator_steps=found.evaluations * objective.integrator_steps,

@@ -20,7 +20,6 @@ from otolith.twin.components import ELAPSED, shift_setting
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, NoiseModel, kernel_of
 
-EXPLAINED = 1.5  # cost up to which the residual counts as noise
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record: least width of the bounds of a start
 TRUNCATION = 1e-3  # share of the noise: largest truncation error of the integrator
 PENALTY = 1e30  # cost of a guess whose prediction is not finite

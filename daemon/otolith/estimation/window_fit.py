@@ -12,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Mask, Window
+from otolith.estimation.evidence import discount, is_explained
 from otolith.estimation.global_search import search_window
 from otolith.estimation.information import (
     MIN_SINGULAR,
@@ -30,7 +31,7 @@ from otolith.estimation.information import (
     without_input_noise,
 )
 from otolith.estimation.minimisers import MAX_STEPS, FitResult, continued, gauss_newton
-from otolith.estimation.objective import EXPLAINED, Objective
+from otolith.estimation.objective import Objective
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem, amplitude_indices
 from otolith.estimation.timing import shifted, with_changes_between
@@ -80,6 +81,16 @@ class Fit:
     def cost(self) -> float:
         """RMSE of the window in units of the noise."""
         return float(np.sqrt(self.window_chi_square / self.count))
+
+    @property
+    def discount(self) -> float:
+        """Factor on the variance of the noise for a residual larger than that; at least one."""
+        return discount(self.window_chi_square, self.count)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the fit leaves nothing but noise of the window."""
+        return is_explained(self.window_chi_square, self.count)
 
     @property
     def parameters(self) -> Array:
@@ -205,6 +216,8 @@ class WindowEstimate:
     outcome: Outcome
     cost: float
     """RMSE in units of the noise."""
+    is_explained: bool
+    """Whether the twin leaves nothing but noise."""
     rmse_configured: tuple[float, ...]
     rmse_estimated: tuple[float, ...]
     rmse_completed: tuple[float, ...]
@@ -251,10 +264,10 @@ def estimate(
     """
     fitted = fit(problem, window, prior, start)
     both = _fit_alone(fitted, fitted.result.evaluations)
-    if fitted.cost > EXPLAINED >= both.cost:
+    if both.is_explained and not fitted.is_explained:
         both = _leave_local_minimum(both)
     outcome, generations = Outcome.CONTINUED, 0
-    is_unexplained = both.cost > EXPLAINED and search is not SwarmSearch.NEVER
+    is_unexplained = not both.is_explained and search is not SwarmSearch.NEVER
     if is_unexplained or (search is SwarmSearch.FROM_BOUNDS and both.is_informative):
         both, outcome, generations = _search(both)
     elif search is SwarmSearch.FROM_BOUNDS:
@@ -286,10 +299,24 @@ class _BothFits:
         return self.values is not self.alone.guess
 
     @property
+    def chi_square(self) -> float:
+        """The lower χ² of the window of the two."""
+        return min(self.alone.chi_square, self.fit.window_chi_square)
+
+    @property
     def cost(self) -> float:
         """The lower cost of the two."""
-        best = min(self.alone.chi_square, self.fit.window_chi_square)
-        return float(np.sqrt(best / self.fit.count))
+        return float(np.sqrt(self.chi_square / self.fit.count))
+
+    @property
+    def discount(self) -> float:
+        """Factor on the variance of the noise for a residual larger than that; at least one."""
+        return discount(self.chi_square, self.fit.count)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the better fit leaves nothing but noise."""
+        return is_explained(self.chi_square, self.fit.count)
 
     @property
     def is_informative(self) -> bool:
@@ -352,7 +379,7 @@ def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
     distance = np.abs(from_search.parameters - from_prediction.parameters)
     if not (distance > DISTINCT * both.information.sd[: len(distance)]).any():
         outcome = Outcome.AGREED
-    elif abs(from_search.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
+    elif abs(from_search.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * after.discount:
         outcome = Outcome.AMBIGUOUS
     else:
         found = Outcome.SEARCH_WAS_BETTER if minimum.has_repeated else Outcome.UNREPEATED
@@ -374,6 +401,7 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         evidence=both.fit.map_objective.evidence(result, both.inflation, has_noisy_inputs=both.has_noisy_inputs),
         outcome=outcome,
         cost=both.cost,
+        is_explained=both.is_explained,
         rmse_configured=tuple(map(float, objective.rmse(configured))),
         rmse_estimated=rmse_estimated,
         rmse_completed=rmse_completed,
@@ -383,7 +411,7 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         generations=generations,
         evaluations=both.evaluations,
         trend_response=_trend_response(both),
-        drifts=both.alone.chi_square > both.fit.window_chi_square + EQUALLY_GOOD * max(both.cost, 1.0) ** 2,
+        drifts=both.alone.chi_square > both.fit.window_chi_square + EQUALLY_GOOD * both.discount,
     )
 
 
