@@ -99,30 +99,45 @@ def test_a_candidate_with_less_than_half_of_the_best_score_is_not_tried(
     assert tried == expected
 
 
+@pytest.mark.parametrize("phases", [1, 2])
 @pytest.mark.parametrize("spread", [1.0, 3.0])
 @pytest.mark.parametrize("count", [4, 8])
 def test_amplitudes_of_noise_agree_as_often_as_stated(
-    count: int, spread: float, monkeypatch: pytest.MonkeyPatch
+    count: int, spread: float, phases: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of either sign, with windows of equal and of different information."""
+    """Of either sign or any phase, with windows of equal and of different information."""
     monkeypatch.setattr(module, "SIGNIFICANCE", 0.02)
     random = np.random.default_rng(count)
-    information = np.geomspace(1.0, spread, count)
-    amplitudes = random.standard_normal((10_000, count)) / np.sqrt(information)
+    roots = np.eye(phases) + (spread - 1.0) * random.uniform(-0.3, 1.0, (count, phases, phases))
+    information = roots.transpose(0, 2, 1) @ roots
+    noise = random.standard_normal((10_000, count, phases))
+    amplitudes = np.linalg.solve(roots[None], noise[..., None])[..., 0]
     agreeing = sum(module._amplitude_sd(values, information) is not None for values in amplitudes)
     assert 0.015 < agreeing / len(amplitudes) < 0.025
 
 
+def test_four_windows_agree_on_a_clear_sine() -> None:
+    """Of ten standard deviations of each window: noise of one of the two parts is no reason to miss it."""
+    random, agreeing = np.random.default_rng(1), 0
+    for _ in range(100):
+        values = np.array([8.0, -6.0]) + random.standard_normal((4, 2))
+        agreeing += module._amplitude_sd(values, np.tile(np.eye(2), (4, 1, 1))) is not None
+    assert agreeing >= 90
+
+
 def test_one_window_alone_shows_no_agreement() -> None:
-    values, information = np.full(8, 10.0), np.ones(8)
+    values, information = np.full((8, 1), 10.0), np.ones((8, 1, 1))
     assert module._amplitude_sd(values, information) is not None
     information[0] = 1e3
     assert module._amplitude_sd(values, information) is None
 
 
 def test_the_sd_of_an_amplitude_is_that_of_a_mean() -> None:
-    values = np.random.default_rng(1).normal(10.0, 0.1, 8)
-    assert module._amplitude_sd(values, np.ones(8)) == pytest.approx(values.std(ddof=1) / np.sqrt(8.0))
+    values, known = np.random.default_rng(1).normal(10.0, 0.1, (8, 1)), np.ones((8, 1, 1))
+    assert module._amplitude_sd(values, known) == pytest.approx(values.std(ddof=1) / np.sqrt(8.0))
+    parts = np.random.default_rng(1).normal((30.0, 40.0), 0.1, (8, 2))
+    both = np.sqrt((parts.var(axis=0, ddof=1).mean()) / 8.0)
+    assert module._amplitude_sd(parts, np.tile(np.eye(2), (8, 1, 1))) == pytest.approx(both)
 
 
 def test_a_slow_sine_of_the_position_does_not_stand_out() -> None:
@@ -144,7 +159,8 @@ def test_a_slow_sine_of_the_position_does_not_stand_out() -> None:
 def test_an_exponent_is_uncertain_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
     healthy = pooled(0.0)
     form = next(form for form in allowed_forms(healthy.problem, healthy.x) if form.model.name == "power")
-    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
+    amplitudes = np.full((10, 1), 5.0), np.ones((10, 1, 1))
+    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: amplitudes)
     shown = module._structure(healthy, ScoredGuess(form, 2.0, np.array([5.0, 0.0]), 50.0))
     assert shown is not None
     assert shown[0].inner_sd == pytest.approx(0.2)
@@ -157,7 +173,8 @@ def test_a_shape_at_a_bound_of_the_search_is_not_offered(
     healthy = pooled(0.0)
     form = next(form for form in allowed_forms(healthy.problem, healthy.x) if form.model.name == "power")
     assert form.bounds == (0.3, 4.0)
-    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
+    amplitudes = np.full((10, 1), 5.0), np.ones((10, 1, 1))
+    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: amplitudes)
     shown = module._structure(healthy, ScoredGuess(form, exponent, np.array([5.0, 0.0]), 50.0))
     assert shown is not None
     assert shown[0].is_at_bound is is_at_bound

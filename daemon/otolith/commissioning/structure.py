@@ -226,18 +226,21 @@ class PooledResponse(ProjectedResponse):
         """Whether a sine has one phase in all windows, and stands out: then it imitates no smooth curve."""
         return not self.is_restarted(guess.form) and self.stands_out((guess.form, guess.inner))
 
-    def amplitudes_of_windows(self, guess: Guess, amplitudes: Array) -> tuple[Array, Array]:
-        """Return the amplitude (windows,) that each window gives, in the pooled phase, and the information on it."""
+    def amplitudes_of_windows(self, guess: Guess) -> tuple[Array, Array]:
+        """Return the amplitudes (windows, phases) that each window gives, and the information on them.
+
+        It is (windows, phases, phases). A sine has a cosine and a sine part; if its phase is another in each window,
+        only the size of both together.
+        """
         columns = self.responses(basis_functions([guess]))
         columns = columns - self._basis @ (self._basis.T @ columns)
         rows = self.slices
+        values = np.array([np.linalg.lstsq(columns[own], self._remainder[own], rcond=None)[0] for own in rows])
+        information = np.array([columns[own].T @ columns[own] for own in rows])
         if self.is_restarted(guess[0]):
-            solved = [np.linalg.lstsq(columns[own], self._remainder[own], rcond=None)[0] for own in rows]
-            return np.linalg.norm(solved, axis=1), np.array([(columns[own] ** 2).sum() / 2.0 for own in rows])
-        along = columns @ (amplitudes[: columns.shape[1]] / np.linalg.norm(amplitudes))
-        information = np.array([along[own] @ along[own] for own in rows])
-        products = np.array([along[own] @ self._remainder[own] for own in rows])
-        return products / np.maximum(information, np.finfo(float).tiny), information
+            mean = np.trace(information, axis1=1, axis2=2) / values.shape[1]
+            return np.linalg.norm(values, axis=1, keepdims=True), mean[:, None, None]
+        return values, information
 
 
 def _rows_of_window(fitted: Fit) -> tuple[Array, Array]:
@@ -336,7 +339,7 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     """Return the structure of a guess, which is then projected out, or None if the windows do not agree on it."""
     form, inner = guess.form, guess.inner
     is_restarted, periodic = pooled.is_restarted(form), len(form.model.phases) > 1
-    sd = _amplitude_sd(*pooled.amplitudes_of_windows((form, inner), guess.amplitudes))
+    sd = _amplitude_sd(*pooled.amplitudes_of_windows((form, inner)))
     if sd is None or (is_restarted and not pooled.stands_out((form, inner))):
         return None
     pooled.add_component(pooled.columns(guess))
@@ -361,19 +364,29 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
 
 
 def _amplitude_sd(values: Array, information: Array) -> float | None:
-    """Return the standard deviation of the weighted mean of the amplitudes ``values`` (windows,), from their scatter.
+    """Return the standard deviation of the weighted mean of amplitudes (windows, phases), from their scatter.
 
-    None if the mean is not significant by Student's t test of both signs: the windows do not agree on an amplitude. The
-    variance of each is inverse to its ``information`` (windows,), times a common factor.
+    None if the mean is not significant: the windows do not agree on an amplitude. The covariance of each is inverse to
+    its ``information`` (windows, phases, phases), times a common factor. The ratio of what the mean explains to the
+    scatter has an F distribution, for one amplitude the square of Student's t. Both parts of a sine count, since noise
+    of any phase has a positive mean in the phase of all windows together (J. D. Victor, J. Mast,
+    Electroencephalography and Clinical Neurophysiology 78, 1991).
     """
-    from scipy.special import stdtr  # noqa: PLC0415 - only a component that would be significant needs SciPy
+    from scipy.special import fdtrc  # noqa: PLC0415 - only a component that would be significant needs SciPy
 
-    shares, degrees = information / information.sum(), len(values) - 1.0
-    mean = float(shares @ values)
-    if not mean or (shares**2).sum() >= MAX_CONCENTRATION:
+    windows, phases = values.shape
+    weights = np.trace(information, axis1=1, axis2=2)
+    if not values.any() or (weights**2).sum() >= MAX_CONCENTRATION * weights.sum() ** 2:
         return None
-    sd = max(float(np.sqrt(shares @ (values - mean) ** 2 / degrees)), ROUNDING * abs(mean))
-    return sd if 2.0 * stdtr(degrees, -abs(mean) / sd) < SIGNIFICANCE else None
+    inverse = np.linalg.pinv(information.sum(axis=0), hermitian=True)
+    mean = inverse @ np.einsum("wpq,wq->p", information, values)
+    explained = float(mean @ information.sum(axis=0) @ mean)
+    left, degrees = values - mean, phases * (windows - 1.0)
+    variance = float(np.einsum("wp,wpq,wq->", left, information, left)) / degrees
+    variance = max(variance, ROUNDING**2 * explained)
+    if not explained or fdtrc(phases, degrees, explained / phases / variance) >= SIGNIFICANCE:
+        return None
+    return float(np.sqrt(variance * (mean @ inverse @ mean) / (mean @ mean)))
 
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:
