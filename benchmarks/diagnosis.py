@@ -33,7 +33,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import EventDocument
-from otolith.machine import LoadedMachine, load_machine
+from otolith.machine import LIBRARY, LoadedMachine, load_machine
 from otolith_drivers.plant import faults
 from otolith_drivers.plant.scenario import load_scenario, simulate
 
@@ -82,7 +82,7 @@ def machine_of(kind: str) -> LoadedMachine:
     text = (CONFIG / "dc-motor.toml").read_text(encoding="utf-8")
     text = text.replace('D = "0.00143 N*m*s/rad"', 'D = { value = "0.00143 N*m*s/rad", estimate = true }')
     if kind == "pump":
-        text = '[machine]\nname = "pump"\n[twin]\nname = "pump"\n'
+        text = f'[machine]\nname = "pump"\n[twin]\nfile = "{LIBRARY / "pump"}.toml"\n'
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "machine.toml"
         path.write_text(text, encoding="utf-8")

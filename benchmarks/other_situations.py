@@ -27,7 +27,7 @@ from benchmarks.diagnosis import HEALTHY_WINDOWS, OK, START, WINDOWS, machine_of
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.machine import LoadedMachine, load_machine
+from otolith.machine import LIBRARY, LoadedMachine, load_machine
 from otolith_drivers.plant import faults
 
 CLASS = "one of several causes, which the data do not distinguish"
@@ -57,10 +57,10 @@ class Result:
 
 
 def machine_with(twin: str) -> LoadedMachine:
-    """Return a machine of a twin as it is in the library, with the noise of the simulated plant."""
+    """Return a machine of a twin as it is in the library, whose values are its own, with the noise of the plant."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "machine.toml"
-        path.write_text(f'[machine]\nname = "m"\n[twin]\nname = "{twin}"\n', encoding="utf-8")
+        path.write_text(f'[machine]\nname = "m"\n[twin]\nfile = "{LIBRARY / twin}.toml"\n', encoding="utf-8")
         machine = load_machine(path, with_driver=False)
     return replace(machine, problem=problem_of(LIBRARY_PLANTS[twin]))
 

@@ -369,12 +369,18 @@ def _plan(
 def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> frozenset[str]:
     """Return the parameters whose nominal values are those of this machine, so that they may be judged by them.
 
-    A friction that stands for an unmeasured load too is not known from a data sheet of the motor.
+    The file states them, or the user's own twin; a twin of the library has those of an example. A friction that stands
+    for an unmeasured load too is not known from a data sheet of the motor.
     """
     written = {name for name, table in file.parameters.items() if table.value is not None}
-    of_twin = {row.name: row for row in complete.parameters}
-    added = {row.name for row in twin.parameters} - of_twin.keys()
-    return frozenset(row.name for row in twin.parameters if row == of_twin.get(row.name)) | (added & written)
+    written |= {row.name for row in complete.parameters} if file.twin.file is not None else set()
+    return frozenset(name for name in written if not stands_for_load(name, twin, complete))
+
+
+def stands_for_load(name: str, twin: Definition, complete: Definition) -> bool:
+    """Whether a parameter of the ``complete`` twin stands in ``twin`` for an unmeasured load too."""
+    own = next((row for row in complete.parameters if row.name == name), None)
+    return own is not None and twin.parameter(name) != own
 
 
 def _with_own_limits(file: MachineFile) -> frozenset[str]:

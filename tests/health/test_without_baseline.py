@@ -6,12 +6,23 @@ from pathlib import Path
 import pytest
 
 from otolith.cli.commissioning.check import lines_without_limits
+from otolith.cli.commissioning.commission import written_value
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import Level
 from otolith.health.prognosis import Baseline, with_baselines
-from otolith.health.schema import ParameterDocument, ReportDocument, Status
-from otolith.machine import LoadedMachine, load_machine
+from otolith.health.schema import (
+    FindingDocument,
+    FindingKind,
+    NumberDocument,
+    ParameterDocument,
+    ReportDocument,
+    Severity,
+    Status,
+)
+from otolith.health.text import headline
+from otolith.machine import LIBRARY, LoadedMachine, load_machine
+from otolith_drivers.grammars.toml_lines import toml_value
 from tests.health.test_events import report
 from tests.messages import assert_says
 
@@ -80,3 +91,73 @@ def test_what_has_no_limits_is_one_line_with_what_to_write(written: str, names: 
     (line,) = lines_without_limits(machine)
     assert_says(line, *names, "watch")
     assert not lines_without_limits(machine_of(tmp_path, WITHOUT_LOAD_SENSOR))
+
+
+@pytest.mark.parametrize("change", [0.6, 1.0, 2.5])
+def test_the_example_of_a_twin_is_no_baseline(change: float, tmp_path: Path) -> None:
+    """Its values are those of another machine: what is far from them is not known to be wrong, nor to be right."""
+    machine = machine_of(tmp_path, '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n')
+    document = shown(machine.plan, R_a=6.5 * change, D=0.00143 * change)
+    assert not document.events
+    assert document.health is not None
+    assert {document.health.state, document.health.parts["bearing"].state} == {Level.NO_DATA}
+    assert_says(headline(document.health), "no baseline", "otolith commission")
+    known = with_baselines(machine.plan, baselines({"R_a": 6.5 * change, "D": 0.00143 * change}))
+    well = shown(known, R_a=6.5 * change, D=0.00143 * change)
+    assert well.health is not None
+    assert {part.state for part in well.health.parts.values()} == {Level.OK}
+    (event,) = shown(known, R_a=6.5 * change, D=0.00143 * change * 2.1).events
+    assert event.state is Level.ACT
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        'D = { value = "0.00143 N*m*s/rad", estimate = true }',
+        'D = { act = "0.0029 N*m*s/rad" }',
+        'D = { act = "+100 %" }',
+    ],
+)
+def test_what_the_machine_file_states_is_a_baseline(written: str, tmp_path: Path) -> None:
+    text = f'[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n[parameters]\n{written}\n'
+    plan = machine_of(tmp_path, text).plan
+    (event,) = shown(plan, R_a=6.5, D=0.0032).events
+    assert (event.part, event.state) == ("bearing", Level.ACT)
+    document = shown(plan, R_a=6.5, D=0.00143)
+    assert document.health is not None
+    assert document.health.parts["bearing"].state is Level.OK
+    assert document.health.parts["winding"].state is Level.NO_DATA
+
+
+def test_the_values_of_an_own_twin_are_those_of_the_machine(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text((LIBRARY / "dc_motor.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    plan = machine_of(tmp_path, '[machine]\nname = "motor"\n[twin]\nfile = "own.toml"\n').plan
+    (event,) = shown(plan, R_a=6.5, D=0.0032).events
+    assert event.state is Level.ACT
+
+
+@pytest.mark.parametrize(("written", "level"), [("", Level.HINT), ('J = "11.71 kg*cm^2"', Level.WATCH)])
+def test_a_known_value_of_the_example_that_does_not_fit_is_a_hint(written: str, level: Level, tmp_path: Path) -> None:
+    """The machine file is to be completed; nothing has happened to the machine."""
+    text = f'[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n[parameters]\n{written}\n'
+    number = NumberDocument(value=0.0016, sd=1e-5, low=0.00158, high=0.00162, unit="kg*m^2")
+    moved = FindingDocument(
+        id="moved", kind=FindingKind.MOVED, subject="J", value=number, severity=Severity.WARNING, condition="",
+        text="", since=0.0,
+    )  # fmt: skip
+    plan, state, document = machine_of(tmp_path, text).plan, HealthState(), report(0)
+    for index in range(40):
+        state, document = assess(plan, state, report(index, findings=(moved,)))
+    (event,) = document.events
+    assert event.state is level
+
+
+def test_what_commissioning_writes_of_motor_and_load_is_judged(tmp_path: Path) -> None:
+    """Also by a replay, which has no baseline but the values of the machine file."""
+    machine = machine_of(tmp_path, WITHOUT_LOAD_SENSOR)
+    row = machine.twin.parameter("D")
+    line = toml_value(written_value(machine, row, 0.004, (0.0, 0.016)))
+    plan = machine_of(tmp_path, f"{WITHOUT_LOAD_SENSOR}[parameters]\nD = {line}\n").plan
+    assert not shown(plan, R_a=6.5, D=0.004).events
+    (event,) = shown(plan, R_a=6.5, D=0.0085).events
+    assert (event.part, event.state) == ("bearing", Level.ACT)

@@ -128,6 +128,10 @@ class MonitoringPlan:
         quantities = (*self.parameters.values(), *self.sites.values())
         return tuple(dict.fromkeys(quantity.part for quantity in quantities))
 
+    def parameters_of(self, part: str) -> list[str]:
+        """Return the names of the estimated parameters of a part."""
+        return [name for name, quantity in self.parameters.items() if quantity.part == part]
+
 
 def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:
     """Return the rows that rest on most evidence; several if the data do not distinguish them."""

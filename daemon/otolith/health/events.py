@@ -512,6 +512,9 @@ def _states(
             key = "no_longer" if any(name in determined for name in missing) else "not_yet"
             reason = plan.texts(key, names=", ".join(missing))
             parts[part] = _kept(earlier, Level.NO_DATA, _begin(earlier, report), reason, missing)
+        elif _waits_for_baseline(plan, part):
+            reason = plan.texts("no_baseline")
+            parts[part] = _kept(earlier, Level.NO_DATA, _begin(earlier, report), reason, ())
         else:
             parts[part] = _kept(earlier, Level.OK, _begin(earlier, report), "", ())
     levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
@@ -544,6 +547,12 @@ def _kept(
 
 def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument) -> tuple[str, ...]:
     """Return the parameters of a part of the twin if the value of none is known."""
-    own = [name for name, quantity in plan.parameters.items() if quantity.part == part] or list(report.parameters)
+    own = plan.parameters_of(part) or list(report.parameters)
     known = any(report.parameters[name].value is not None for name in own if name in report.parameters)
     return () if known or part not in plan.parts else tuple(own)
+
+
+def _waits_for_baseline(plan: MonitoringPlan, part: str) -> bool:
+    """Whether no limit of the parameters of a part of the twin is judged, because all of them wait for a baseline."""
+    own = [plan.parameters[name] for name in plan.parameters_of(part) or plan.parameters]
+    return part in plan.parts and any(row.waiting for row in own) and not any(row.limits for row in own)

@@ -169,7 +169,9 @@ def _of_finding(
         quantity = plan.known.get(finding.subject, MonitoredQuantity())
         part = quantity.part
         passed, limit = quantity.level(value.value, value.sd, *_held(finding.id, before, past))
-        level = passed if quantity.limits else level
+        # The value of an example is that of the file to complete, and none of the machine.
+        of_example = Level.HINT if is_from_start and quantity.waiting else level
+        level = passed if quantity.limits else of_example
         deviation = value.value - quantity.nominal
         features = replace(features, side="below" if deviation < 0.0 else "above", manner="step")
         numbers = _numbers(value.value, value.sd, value.unit, limit)

@@ -171,23 +171,25 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
         else:
             remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, from {data.name}"
             remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({row.meaning})")
-        value = _written_value(machine, row, item.value, _bounds(row, item.value))
+        value = written_value(machine, row, item.value, _bounds(row, item.value))
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
         row, largest = machine.twin.parameter(name), max(abs(low), abs(high))
         if largest > LOAD_SHARE * max(abs(row.low), abs(row.high)):
             ends = (0.0 if row.low >= 0.0 else -REACH * largest, 0.0 if row.high <= 0.0 else REACH * largest)
-            lines[name] = NewLine(_written_value(machine, row, 0.5 * (low + high), ends), row.meaning)
+            lines[name] = NewLine(written_value(machine, row, 0.5 * (low + high), ends), row.meaning)
     return lines, remarks
 
 
-def _written_value(
+def written_value(
     machine: "LoadedMachine", row: "Parameter", value: float, bounds: tuple[float, float]
 ) -> dict[str, object] | str:
     """Return a found value as the file gets it; raise ConfigurationError if bounds that the file states exclude it.
 
-    ``bounds`` are those of an estimate for which the file states none.
+    ``bounds`` are those of an estimate for which the file states none. A friction that stands for an unmeasured load
+    too gets its limits: they hold for this value, not for that of a data sheet.
     """
+    from otolith.machine import stands_for_load
     from otolith.machine_file import ParameterTable
     from otolith.twin.definition import Role
     from otolith_drivers.errors import ConfigurationError
@@ -197,12 +199,16 @@ def _written_value(
     if not (row.role is Role.ESTIMATED if stated.estimate is None else stated.estimate):
         return text
     ends = (stated.low, bounds[0]), (stated.high, bounds[1])
-    low, high = (default if written is None else Quantity(unit)(written) for written, default in ends)
+    low, high = (default if own is None else Quantity(unit)(own) for own, default in ends)
     if not low <= value <= high:
         fault = f"the data show {value:.4g} {unit}, outside the bounds {low:.4g} to {high:.4g} {unit} of the file"
         remedy = "nothing is written: correct low and high, or write the value of your machine"
         raise ConfigurationError(f"{machine.path}: parameters.{row.name}: {fault}: {remedy}")
-    return {"value": text, "estimate": True, "low": f"{low:.4g} {unit}", "high": f"{high:.4g} {unit}"}
+    written: dict[str, object] = {"value": text, "estimate": True}
+    written |= {"low": f"{low:.4g} {unit}", "high": f"{high:.4g} {unit}"}
+    if stands_for_load(row.name, machine.twin, machine.complete) and (stated.watch, stated.act) == (None, None):
+        written |= {"watch": list(row.watch), "act": list(row.act)}
+    return written
 
 
 def _bounds(row: "Parameter", value: float) -> tuple[float, float]:
@@ -492,7 +498,7 @@ def baseline(file: Path, clear: bool) -> None:
     machine, store = loaded(file)
     if clear:
         store.operator.change(lambda before: replace(before, baselines={}))
-        echo("limits in percent refer to the nominal values of the machine file")
+        echo("limits in percent refer to the values that the machine file states; others are not judged")
     else:
         keep_baseline(machine, store, store.histories(), {})
 
@@ -528,7 +534,8 @@ def keep_baseline(
         if (item := kept.get(name)) is not None:
             lines += _baseline_lines(machine, labels or store.labels(), name, item)
         else:
-            lines.append(f"{name}: no baseline, its limits stay as they were: {search.reason}")
+            then = "its limits wait for one" if limited[name].waiting else "its limits stay as they were"
+            lines.append(f"{name}: no baseline, {then}: {search.reason}")
         if item is None or search.reason:
             lines += [f"  {name} is not known well: {search.reason}"] if item is not None else []
             lines.append(f"  what would determine it: {advice.get(name) or MORE_MOTION}")
