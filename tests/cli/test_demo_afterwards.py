@@ -61,7 +61,7 @@ def test_the_last_line_of_a_demo_works_when_pasted(tmp_path: Path, monkeypatch: 
     pasted = subprocess.run(shlex.split(command), capture_output=True, text=True, check=True)
     text = Page((tmp_path / pasted.stdout.strip()).read_text(encoding="utf-8")).text
     assert_says(text, "6.500 ± 0.020 Ω", "state at the last report")
-    assert "NO DATA" not in text
+    assert "UNKNOWN" not in text
 
 
 def test_a_name_without_a_machine_means_the_last_demo() -> None:

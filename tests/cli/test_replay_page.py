@@ -45,7 +45,7 @@ def test_the_page_of_a_log_has_the_times_of_its_data(tmp_path: Path, rows: Lines
     replayed(written(tmp_path, dated(rows)), "--report", page)
     text = text_of(page)
     assert_says(text, "2026-09-", "data.csv", "R_a", "armature resistance")
-    assert "NO DATA" not in text  # no daemon is missing
+    assert "UNKNOWN" not in text  # no daemon is missing
     assert "daemon" not in text
     assert not re.search(r"19[67]\d-|20[013-9]\d-", text)
 
@@ -91,7 +91,7 @@ def test_the_history_of_a_log_is_kept_and_shown_up_to_its_end(
     assert result.exception is None
     text = text_of(tmp_path / result.stdout.strip())
     assert_says(text, "2026-09-", "data.csv", "state at the last report")
-    assert "NO DATA" not in text
+    assert "UNKNOWN" not in text
     assert "R_a" in run("history", history, "--since", "1h").stdout
     again = run("replay", MACHINE, data, "--history", folder).exception
     assert isinstance(again, ConfigurationError)

@@ -155,10 +155,10 @@ def test_what_is_not_determined_is_said_once() -> None:
 def test_a_state_of_the_daemon_hides_no_missing_data() -> None:
     failing = PartDocument(state=Level.WATCH, since=9.0, reason="the daemon cannot write")
     health = HealthDocument(state=Level.WATCH, since=9.0, parts={"winding": unknown("R_a"), "daemon": failing})
-    assert_says(headline(health), "WATCH", "daemon: the daemon cannot write", "NO DATA", "winding", "R_a")
+    assert_says(headline(health), "WATCH", "daemon: the daemon cannot write", "UNKNOWN", "winding", "R_a")
     told = EVENT.model_copy(update={"state": Level.WATCH, "condition": failing.reason})
-    assert_says(headline(health, events=(told,)), "WATCH", "NO DATA", "winding", "R_a")
-    assert "NO DATA" not in headline(of_parts(Level.ACT, winding="worn"))
+    assert_says(headline(health, events=(told,)), "WATCH", "UNKNOWN", "winding", "R_a")
+    assert "UNKNOWN" not in headline(of_parts(Level.ACT, winding="worn"))
 
 
 @pytest.mark.parametrize("language", LANGUAGES)

@@ -124,7 +124,7 @@ def test_one_window_is_a_point() -> None:
 
 def test_a_history_without_a_report_is_no_data() -> None:
     text = page(written([])).text
-    assert "NO DATA The history has no report. What to do:" in text
+    assert "UNKNOWN The history has no report. What to do:" in text
 
 
 def test_a_parameter_without_a_value_is_named_with_reason_and_advice() -> None:
@@ -133,7 +133,7 @@ def test_a_parameter_without_a_value_is_named_with_reason_and_advice() -> None:
         update={"value": None, "sd": None, "low": None, "high": None, "status": Status.UNESTIMATED,
                 "reason": "the motor is at rest", "advice": "let it turn"})  # fmt: skip
     text = page(written([report.model_copy(update={"parameters": {"R_a": parameter}})]), now=START + 2.0).text
-    assert "NO DATA since" in text
+    assert "UNKNOWN since" in text
     assert "not determined yet: R_a" in text
     assert "No value in this time." in text
     assert "R_a : not estimated in 1 of the last 1 windows: the motor is at rest What would help: let it turn" in text
@@ -148,11 +148,11 @@ def test_gaps_are_hatched_and_interrupt_the_curve() -> None:
 
 def test_a_daemon_that_has_stopped_is_no_data_with_the_last_state() -> None:
     text = page(written(reports(50, health=state_of(Level.ACT, START, "worn"))), now=START + 7300.0).text
-    assert "NO DATA no report since" in text
+    assert "UNKNOWN no report since" in text
     assert "(2 h)" in text
     assert "The last report: ACT since" in text
     well = page(written(reports(50, health=state_of(Level.OK, START))), now=START + 7300.0).text
-    assert "whole machine NO DATA" in well
+    assert "whole machine UNKNOWN" in well
     assert "No limit is passed" not in well
 
 

@@ -8,8 +8,12 @@ import pytest
 
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LiveTable
+from otolith.discovery.hypotheses import FaultType
 from otolith.health.limits import Level
 from otolith.health.schema import (
+    AlternativeDocument,
+    EventDocument,
+    EvidenceDocument,
     FindingDocument,
     FindingKind,
     HealthDocument,
@@ -64,3 +68,38 @@ def test_every_screen_says_what_to_do(language: Language, tmp_path: Path) -> Non
         assert text.count(say("what_to_do")) == 1, name
         assert "something new" in text, name
         assert say("all_well") not in text, name
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_what_is_known_and_grave_comes_before_what_is_open(language: Language, tmp_path: Path) -> None:
+    """Nobody is told to let a machine run that is at ACT."""
+    say, base = texts_in(language), undecided(language)
+    assert base.health is not None
+    health = base.health.model_copy(update={"state": Level.ACT})
+    event = EventDocument(
+        id="limit/R_a@1", part="winding", state=Level.ACT, start=START, since=START, condition="worn", text="far off",
+        advice="call", evidence=EvidenceDocument(windows=(1, 2)), language=language,
+    )  # fmt: skip
+    document = base.model_copy(update={"health": health, "events": (event,)})
+    for name, text in shown(document, tmp_path).items():
+        assert -1 < text.find("far off") < text.find("something new"), name
+        assert say("undecided_advice") not in text, name
+
+
+@pytest.mark.parametrize("details", [False, True])
+def test_causes_that_are_equally_likely_have_formulas_for_the_specialist_only(details: bool) -> None:
+    """A class that is no event yet is open to people, as is a test that goes on."""
+    formulas = "several hypotheses explain it: shaft: 0.0047·sin(1·θ) N·m"
+    base = undecided("en")
+    finding = base.findings[0].model_copy(
+        update={"id": "undecided", "kind": FindingKind.CLASS, "condition": "equally", "text": formulas}
+    )
+    causes = tuple(AlternativeDocument(reason=FaultType.COMPONENT, text=formulas, probability=0.5) for _ in range(2))
+    parameters = {name: row.model_copy(update={"reason": formulas}) for name, row in base.parameters.items()}
+    document = base.model_copy(update={"findings": (finding,), "explanations": causes, "parameters": parameters})
+    table, console = LiveTable(lambda: "", details=details), Terminal(file=io.StringIO(), width=200)
+    table.add(document.to_json())
+    console.print(table)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "(2 candidates)" in text
+    assert ("sin(" in text) is details

@@ -30,7 +30,7 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.cli.terminal import echo_json
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import LINE, announcements, brief, event_text, headline, undecided_text
+from otolith.health.text import LINE, announcements, brief, event_text, headline, undecided_finding, undecided_text
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -180,7 +180,7 @@ class Demo:
         self._history = path_in(self._folder / "history", names.site, names.name)
         self._console = Terminal(stderr=as_json)
         self._reports: list[ReportDocument] = []
-        self._undecided = ""  # As it was printed last
+        self._undecided: float | None = None  # Begin of what is open and was printed last, Unix s
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def run(self, stopped: Callable[[], bool]) -> int:
@@ -264,10 +264,10 @@ class Demo:
     def _print_plain(self, report: ReportDocument) -> None:
         """Print a report in a line, and in another one what is new while its cause is not yet known: once."""
         self._print(brief(report, _time_of_day))
-        undecided = undecided_text(report, _time_of_day)
-        if undecided and undecided != self._undecided:
-            self._print_wrapped(undecided)
-        self._undecided = undecided
+        undecided = undecided_finding(report)
+        if undecided is not None and undecided.since != self._undecided:
+            self._print_wrapped(undecided_text(report, _time_of_day))
+            self._undecided = undecided.since
 
     def _print_wrapped(self, text: str, style: str = "") -> None:
         for line in textwrap.wrap(text, LINE, subsequent_indent="  ", break_on_hyphens=False):

@@ -36,7 +36,7 @@ from otolith.health.times import Clock, clock_in, in_local_time
 from otolith_drivers.units import equation_text, quantity_text, scale_of, unit_text
 
 UNKNOWN = "unknown"
-UNKNOWN_STATE = "UNKNOWN"
+UNDECIDED = (FindingKind.OPEN, FindingKind.CLASS)  # Findings of which it is open what causes them
 ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
 PARTS = "; "
 LINE = 100  # characters that fit into a log beside its time; engineering choice
@@ -250,11 +250,6 @@ def announcements(document: ReportDocument) -> list[EventDocument]:
     return [event for event in document.events if event.change is not None]
 
 
-def state_word(part: PartDocument) -> str:
-    """The state of a part: there may be data without a parameter that they determine."""
-    return UNKNOWN_STATE if part.undetermined else part.state
-
-
 def headline(health: HealthDocument, when: Clock | None = None, events: Collection[EventDocument] = ()) -> str:
     """State of the machine, since when, and which parts are in it and why; also what is not known beside that.
 
@@ -262,7 +257,7 @@ def headline(health: HealthDocument, when: Clock | None = None, events: Collecti
     """
     texts, told = texts_in(health.language), {event.condition for event in events}
     when = when or clock_in(health.timezone)
-    state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
+    state = f"{texts.translated(health.state)} {texts('since', time=when(health.since))}"
     state += "" if health.shelved is None else f" ({texts('shelved_until', time=when(health.shelved))})"
     own = {name: part for name, part in health.parts.items() if part.state is health.state}
     reasons = {reason: names for reason, names in reasons_of(own).items() if reason not in told}
@@ -296,16 +291,29 @@ def unknown_text(health: HealthDocument, events: Collection[EventDocument] = ())
     return f"{texts.translated(Level.NO_DATA)}: {why}" if why else ""
 
 
+def undecided_finding(document: ReportDocument) -> FindingDocument | None:
+    """Return the finding of which it is open what causes it, and that no event tells of; None without one."""
+    told = [event.id.partition("@")[0] for event in document.open_events]
+    return next((item for item in document.findings if item.kind in UNDECIDED and item.id not in told), None)
+
+
 def undecided_text(document: ReportDocument, when: Clock | None = None) -> str:
     """What is new, since when, and how many causes are possible, while it is open which one holds; else empty."""
-    texts = texts_in(document.health.language) if document.health else texts_in("en")
-    finding = next((item for item in document.findings if item.kind is FindingKind.OPEN), None)
-    if finding is None:
+    if (finding := undecided_finding(document)) is None:
         return ""
+    texts = texts_in(document.health.language if document.health else "en")
     when = when or clock_in(zone_of(document))
+    what = finding.condition if finding.kind is FindingKind.OPEN else texts("changed")
     count, since = len(document.explanations), texts("since", time=when(finding.since))
     causes = texts("candidates", count=count) if count > 1 else ""
-    return texts("undecided", what=finding.condition, since=since, causes=causes)
+    return texts("undecided", what=what, since=since, causes=causes)
+
+
+def undecided_advice(document: ReportDocument) -> str:
+    """What to do while it is open which cause holds; empty if what is known requires action."""
+    if document.health is not None and document.health.state is Level.ACT:
+        return ""
+    return texts_in(document.health.language if document.health else "en")("undecided_advice")
 
 
 def zone_of(document: ReportDocument) -> str | None:
@@ -315,12 +323,13 @@ def zone_of(document: ReportDocument) -> str | None:
 
 def brief(document: ReportDocument, when: Clock | None = None) -> str:
     """A report in one line of at most :data:`LINE` characters: time, state, and the parameters that have room."""
-    state = "" if document.health is None else f" {state_word(document.health)}"
+    texts = texts_in(document.health.language if document.health else "en")
+    state = "" if document.health is None else f" {texts.translated(document.health.state)}"
     when = when or clock_in(zone_of(document))
     line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
-    texts = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
-    for index, text in enumerate(texts):
-        left = len(texts) - index - 1
+    values = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
+    for index, text in enumerate(values):
+        left = len(values) - index - 1
         rest = f", and {left} more" if left else ""
         if len(f"{line}, {text}{rest}") > LINE:
             return f"{line}, and {left + 1} more"

@@ -32,8 +32,8 @@ from otolith.health.text import (
     headline,
     note_texts,
     probability_text,
-    state_word,
     texts_in,
+    undecided_advice,
     undecided_text,
     unknown_text,
     value_text,
@@ -410,18 +410,16 @@ def operator_text(document: ReportDocument) -> str:
         return f"# {document.machine}"
     texts = texts_in(health.language)
     current, undecided = document.open_events, undecided_text(document)
-    lines = [f"# {texts.translated(state_word(health))}"]
+    lines = [f"# {texts.translated(health.state)}"]
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
         lines[0] += f"\n{texts('since', time=moment_text(health.since, health.timezone))}"
         why = health.reason or ("" if undecided else texts("all_well"))
         lines += [markdown_text(why)] if why and not current else []
     lines += [markdown_text(unknown)] if (unknown := unknown_text(health, current)) else []
-    if undecided:
-        lines += [
-            f"**{markdown_text(undecided)}**",
-            f"**{texts('what_to_do')}: {markdown_text(texts('undecided_advice'))}**",
-        ]
     lines += [_paragraph(event, health.state) for event in current]
+    lines += [f"**{markdown_text(undecided)}**"] if undecided else []
+    if undecided and (advice := undecided_advice(document)):
+        lines += [f"**{texts('what_to_do')}: {markdown_text(advice)}**"]
     return texts.decimals("\n\n".join(lines))
 
 

@@ -35,8 +35,8 @@ from otolith.health.text import (
     interval_text,
     note_texts,
     probability_text,
-    state_word,
     texts_in,
+    undecided_advice,
     undecided_text,
     value_cells,
     value_text,
@@ -209,14 +209,11 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
     texts, parts = texts_of(document), Text()
     say = texts.translated
     for name, part in health.parts.items():
-        parts.append(f"{texts.part(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
+        parts.append(f"{texts.part(name)} ").append(say(part.state), style=LEVEL_STYLES[part.state]).append("  ")
     current, when = document.open_events, clock_in(zone_of(document))
     is_in_headline = len(current) == 1  # several events have a line each instead
     own_lines = () if is_in_headline else current
     lines = [Text(headline(health, events=own_lines), style=LEVEL_STYLES[health.state]), parts]
-    if undecided := undecided_text(document):
-        lines.append(Text(undecided, style="bold magenta"))
-        lines.append(Text(f"{texts('what_to_do')}: {texts('undecided_advice')}", style="bold"))
     for event in current:
         if not is_in_headline or event.state is not health.state:
             what, since = f"{say(event.state)}: {texts.part(event.part)}: {event.condition}", when(event.since)
@@ -227,6 +224,10 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
         lines += [Text(command, style="dim")] if (command := explain_command(event)) else []
         lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
+    if undecided := undecided_text(document):
+        advice = undecided_advice(document)
+        lines.append(Text(undecided, style="bold magenta"))
+        lines += [Text(f"{texts('what_to_do')}: {advice}", style="bold")] if advice else []
     hints = document.hints if details else ()
     return [*lines, *(Text(event_text(event, details=True), style=HINT_STYLE) for event in hints)]
 
@@ -311,7 +312,7 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         if details and (expected := forecast_text(parameter, document.window.end, texts.language)):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
     candidates = [finding for finding in document.findings if finding.kind is FindingKind.OPEN]
-    if (candidates or document.hints) and not details:
+    if (candidates or document.explanations or document.hints) and not details:
         return lines
     for key, style in (("reason", "yellow"), ("advice", "cyan"))[bool(bad) :]:
         names: dict[str, list[str]] = {}
