@@ -54,7 +54,7 @@ check: $(DEV)
 
 # The pages of conditions in docs, from the rules of the diagnosis and their texts.
 conditions: $(DEV)
-	$(BIN)/python -m otolith explain --markdown > docs/conditions.md
+	$(BIN)/python -m otolith explain --markdown --language en > docs/conditions.md
 	$(BIN)/python -m otolith explain --markdown --language de > docs/conditions.de.md
 
 bench: $(BENCH)

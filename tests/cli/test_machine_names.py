@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from otolith.cli import common
 from otolith.cli.machines import file_of, key_of, last_spoken, reader_of
 from otolith.cli.main import cli
+from otolith.cli.operation.live_table import FIRST_ANSWER, waiting_text
 from otolith.cli.operation.view import Recordings
 from otolith.machine import load_machine
 from otolith.storage.history import describe_machine, history_path
@@ -133,6 +134,14 @@ def test_who_watches_a_daemon_that_has_ended_learns_when_it_spoke_last(machine_f
     assert len(lines) == (spelling != "other")
     for line in lines:
         assert_says(line, f"{SITE}.{MACHINE}", "60 min ago", f"otolith report {SITE}.{MACHINE}")
+
+
+def test_a_machine_is_named_as_silent_only_when_its_daemon_had_time_to_answer() -> None:
+    """Meanwhile another one may be about to answer: the first line must not name a wrong machine."""
+    spoken = [f"{SITE}.{MACHINE} spoke last an hour ago"]
+    assert MACHINE not in waiting_text(0.0, spoken)
+    assert MACHINE not in waiting_text(0.9 * FIRST_ANSWER, spoken)
+    assert_says(waiting_text(1.1 * FIRST_ANSWER, spoken), "no daemon", spoken[0])
 
 
 def test_a_history_says_nothing_of_where_its_file_is_to_a_reader_of_values(machine_file: Path) -> None:

@@ -10,7 +10,8 @@ from click.testing import CliRunner
 from otolith.cli.main import cli
 from otolith.health.conditions import condition_page, markdown, pages_of
 from otolith.health.diagnosis import Rule
-from otolith.health.schema import LANGUAGES, EventChange, FindingKind, Language
+from otolith.health.limits import Level
+from otolith.health.schema import LANGUAGES, EventChange, FindingKind, HealthDocument, Language
 from otolith.health.text import texts_in
 from otolith.machine import find_twin, load_rules
 from otolith.storage.history import describe_machine, history_path
@@ -81,7 +82,19 @@ def test_the_command_explains_and_lists() -> None:
         otolith("explain", "unbalence")
 
 
-def monitored(own: Rule) -> None:
+@pytest.mark.parametrize("given", ["", "name", "file"])
+def test_a_condition_is_explained_in_the_language_of_the_machine(given: str, tmp_path: Path) -> None:
+    """Its events name the command without an option, and nobody translates for the night shift."""
+    file = tmp_path / "machine.toml"
+    file.write_text('[machine]\nname = "new"\nlanguage = "de"\n[twin]\nname = "dc_motor"\n', encoding="utf-8")
+    if given != "file":
+        monitored(OWN, "de")
+    machine = {"": (), "name": ("--machine", MACHINE), "file": ("--machine", str(file))}[given]
+    assert_says(otolith("explain", "unbalance", *machine).output, "auswuchten")
+    assert_says(otolith("explain", "unbalance", *machine, "--language", "en").output, "balance the rotor")
+
+
+def monitored(own: Rule, language: Language = "en") -> None:
     """Write a history of a machine whose file has a rule, and with one event of it."""
     end = 1_700_000_000.0
     plan = replace(PLAN, rules=(own, *PLAN.rules))
@@ -89,7 +102,8 @@ def monitored(own: Rule) -> None:
     numbers, _ = writer.open(end)
     raised = event(50, end, EventChange.RAISED).model_copy(update={"condition_id": own.id})
     writer.description = describe_machine(find_twin("dc_motor"), plan)
-    writer.add(numbers.number(document(50, end).model_copy(update={"events": (raised,)})))
+    health = HealthDocument(state=Level.OK, since=end, parts={}, language=language)
+    writer.add(numbers.number(document(50, end).model_copy(update={"events": (raised,), "health": health})))
     writer._write_waiting()
     writer._close()
 

@@ -17,6 +17,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.cli.operation.live_table import LiveTable
+from otolith.cli.replay import ReplaySummary
 from otolith.health import text as module
 from otolith.health.limits import Level
 from otolith.health.observations import BUS, DAEMON, SENSORS
@@ -223,13 +224,18 @@ def shown(documents: list[ReportDocument], folder: Path) -> dict[str, str]:
     for document in documents:
         table.add(document.model_copy(update={"counters": counters}).to_json())
     Console(file=output, width=250).print(table)
+    summary, replayed = ReplaySummary(), io.StringIO()
+    for document in documents:
+        summary.add(document)
+    Console(file=replayed, width=250).print(summary)
     events = "\n".join(event_text(event) for document in documents for event in announcements(document))
     titles = re.findall(r'title="[^"]*"', page)
     body = re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)
     layout = list(names_in(blueprint(machine.recorded(Sampling.TRUE)).root_container))
     assert "Ereignisse" in layout
     recording = f"{operator_text(last)} {report_text(last)} {layout}"
-    return {"page": f"{body} {titles}", "table": output.getvalue(), "events": events, "recording": recording}
+    return {"page": f"{body} {titles}", "table": output.getvalue(), "events": events, "recording": recording,
+            "replay": replayed.getvalue()}  # fmt: skip
 
 
 @pytest.mark.parametrize(("scenario", "count"), [("demo", 45), ("sensor-frozen", 22), ("demo", 1)])

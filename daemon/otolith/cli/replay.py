@@ -8,19 +8,19 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, restore_components
 from otolith.cli.common import echo_warnings, progress_line
-from otolith.cli.console import Terminal
-from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
+from otolith.cli.console import Localised, Terminal
+from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, texts_of, title
 from otolith.cli.terminal import echo
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
-from otolith.health.text import component_text, event_text, finding_text, headline, undecided_text, value_cells, zone_of
+from otolith.health.text import PARTS, Texts, component_text, event_text, headline, undecided_text, value_cells, zone_of
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
@@ -61,51 +61,60 @@ class ReplaySummary:
         self._reasons.add(document.window.index, document.window.quality.reasons)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Parameters, components and findings of the last report, and the counts."""
+        """Parameters, components and findings of the last report, and the counts, in the language of the machine."""
         del console
         if self._first is None or self._last is None:
             yield Text("no window")
             return
-        last, zone = self._last, zone_of(self._last)
-        when = clock_in(zone)
+        decimals = texts_of(self._last).decimals
+        for part in self._parts(self._first, self._last, options.max_width):
+            yield Localised(part, decimals)
+
+    def _parts(self, first: ReportDocument, last: ReportDocument, width: int) -> Iterator[RenderableType]:
+        zone, texts = zone_of(last), texts_of(last)
+        when, say = clock_in(zone), texts.translated
         if last.health is not None:
             yield Text(headline(last.health, events=self._events.values()), style=LEVEL_STYLES[last.health.state])
         if undecided := undecided_text(last):
             yield Text(undecided, style="bold magenta")
-        yield title(last, f", from {when(self._first.window.start)} to {when(last.window.end)}")
-        yield self._parameters(last, options.max_width)
+        yield title(last, f", {say(f'from {when(first.window.start)} to {when(last.window.end)}')}")
+        yield self._parameters(last, width, texts)
         for reason in dict.fromkeys(parameter.reason for parameter in last.parameters.values() if parameter.reason):
             names = ", ".join(name for name, parameter in last.parameters.items() if parameter.reason == reason)
-            yield Text(f"{names} in the last window: {in_local_time(reason, zone)}", style="yellow")
+            yield Text(f"{names}, {say('last window')}: {in_local_time(say(reason), zone)}", style="yellow")
         for component in last.components:
-            yield Text(f"{component_text(component)}, since {when(component.onset)}", style="bold red")
+            since = texts("since", time=when(component.onset))
+            yield Text(f"{component_text(component, texts)}, {since}", style="bold red")
         for event in self._events.values():
             yield Text(event_text(event, details=True), style=event_style(event))
-        candidates = (finding for finding in last.findings if finding.kind is FindingKind.OPEN)
-        yield from (Text(in_local_time(finding_text(finding), zone), style="magenta") for finding in candidates)
-        yield from self._counts(zone)
+        for finding in last.findings:
+            if finding.kind is FindingKind.OPEN:
+                text = PARTS.join(filter(None, (finding.text, finding.advice, finding.setting)))
+                yield Text(f"{texts('open_test')}: {in_local_time(text, zone)}", style="magenta")
+        yield from self._counts(last, texts)
 
-    def _parameters(self, last: ReportDocument, width: int) -> Table:
+    def _parameters(self, last: ReportDocument, width: int, texts: Texts) -> Table:
+        say = texts.translated
         seen = [kind for kind in Status if any(self._statuses[name, kind] for name in last.parameters)]
-        table = parameter_table("last window", *seen, width=width)
+        table = parameter_table("last window", *seen, width=width, texts=texts)
         for name, parameter in last.parameters.items():
-            status = Text(parameter.status, style=STYLES[parameter.status])
+            status = Text(say(parameter.status), style=STYLES[parameter.status])
             counts = (str(self._statuses[name, kind]) for kind in seen)
-            table.add_row(name, *value_cells(parameter), status, *counts)
+            table.add_row(name, *map(say, value_cells(parameter)), status, *counts)
         return table
 
-    def _counts(self, zone: str | None) -> Iterator[Text]:
-        windows, bad = self._decisions.total(), self._decisions[WindowDecision.BAD]
+    def _counts(self, last: ReportDocument, texts: Texts) -> Iterator[Text]:
+        windows, bad, say = self._decisions.total(), self._decisions[WindowDecision.BAD], texts.translated
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
-        yield Text(f"{counted(windows, 'window')}: {windows - bad} good, {bad} bad; {explained}")
-        if self._seconds and self._last is not None:
-            length = self._last.window.end - self._last.window.start
-            yield Text(computing_time_text(median(self._seconds), max(self._seconds), length))
+        yield Text(say(f"{counted(windows, 'window')}: {windows - bad} good, {bad} bad; {explained}"))
+        if self._seconds:
+            length = last.window.end - last.window.start
+            yield Text(say(computing_time_text(median(self._seconds), max(self._seconds), length)))
         for decision, count in self._decisions.items():
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
-                yield Text(f"  {count} good, but: {decision.in_words}", style="yellow")
+                yield Text(say(f"  {count} good, but: {decision.in_words}"), style="yellow")
         for count, example in self._reasons.most_frequent():
-            yield Text(f"  {count} bad like: {in_local_time(example, zone)}", style="red")
+            yield Text(say(f"  {count} bad like: {in_local_time(example, zone_of(last))}"), style="red")
 
 
 def replay(

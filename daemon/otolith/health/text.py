@@ -139,9 +139,9 @@ def parameter_text(name: str, parameter: ParameterDocument) -> str:
     return f"{text} ({parameter.status}: {parameter.reason})"
 
 
-def component_text(component: ComponentDocument) -> str:
+def component_text(component: ComponentDocument, texts: Texts) -> str:
     """Site, equation and approval of a component that the twin lacks."""
-    return f"{component.meaning}: {equation_text(component.equation)} ({approval_text(component, texts_in('en'))})"
+    return f"{component.meaning}: {equation_text(component.equation)} ({approval_text(component, texts)})"
 
 
 def approval_text(component: ComponentDocument, texts: Texts) -> str:

@@ -1,13 +1,16 @@
 """``otolith explain``: what a condition of an event means, what to do, whether to stop, and when it clears."""
 
+import contextlib
 import shutil
 import textwrap
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from otolith.cli.common import AS_JSON
-from otolith.cli.machines import own_histories, reader_of
+from otolith.cli.machines import is_file, own_histories, reader_of
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.errors import ConfigurationError, OtolithError, nearest
 
@@ -23,7 +26,12 @@ MAX_WIDTH = 100  # characters of a line; engineering choice
 @click.command()
 @click.argument("conditions", nargs=-1, metavar="[CONDITION]...")
 @click.option("--machine", metavar="FILE|MACHINE", help="With the rules and in the language of this machine.")
-@click.option("--language", type=click.Choice(LANGUAGES), show_default=False, help="[default: of the machine, or en]")
+@click.option(
+    "--language",
+    type=click.Choice(LANGUAGES),
+    show_default=False,
+    help="[default: of the machine, or en]",
+)
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print all of them as one page of Markdown.")
 @AS_JSON
 def explain(
@@ -49,7 +57,7 @@ def explain(
     if conditions and as_markdown:
         raise click.UsageError("--markdown prints all conditions: give no CONDITION with it")
     reader = None if machine is None else reader_of(machine)
-    language = language or _language(reader)
+    language = language or _language(machine, reader)
     joined = " ".join(conditions)
     own = _own_rules(reader, (*conditions, joined))
     rules, texts = (*own, *load_rules(language)), texts_in(language)
@@ -76,9 +84,25 @@ def explain(
                 echo(*textwrap.wrap(line, width, initial_indent="  ", subsequent_indent="    "))
 
 
-def _language(reader: "HistoryReader | None") -> "Language":
-    reports = [] if reader is None or not reader.path.is_file() else reader.latest(1)
-    return reports[0].health.language if reports and reports[0].health else "en"
+def _language(machine: str | None, reader: "HistoryReader | None") -> "Language":
+    """Return the language of a machine; without one that which all machines here share, or English.
+
+    A machine file says it, also before its first report.
+    """
+    if machine is not None and is_file(machine) and machine.endswith(".toml"):
+        from otolith.machine import load_machine
+
+        return load_machine(Path(machine), with_driver=False).file.machine.language
+    languages = {language for each in (own_histories() if reader is None else [reader]) for language in _reported(each)}
+    return languages.pop() if len(languages) == 1 else "en"
+
+
+def _reported(reader: "HistoryReader") -> "Iterator[Language]":
+    """Yield the language of the last report of a history, if there is one that can be read."""
+    with contextlib.suppress(OtolithError):
+        for report in reader.latest(1) if reader.path.is_file() else ():
+            if report.health is not None:
+                yield report.health.language
 
 
 def _own_rules(reader: "HistoryReader | None", names: tuple[str, ...]) -> "tuple[Rule, ...]":

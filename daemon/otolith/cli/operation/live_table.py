@@ -77,6 +77,7 @@ RIGHT = {"value", "± 95 %", "change"}
 MAX_QUEUED = 100  # reports that wait for a slow terminal; later ones come from the history
 PAUSE = 0.2  # s; how late a stop is noticed
 PATIENCE = 5.0  # s without a report until the stream prints what it waits for
+FIRST_ANSWER = 3.0  # s in which a daemon of this computer answers, before which none is said to be missing
 
 
 @dataclass(slots=True)
@@ -399,9 +400,11 @@ def watch_reports(
         try:
             spoken = () if connection.endpoints else tuple(last_spoken(machine))  # of the daemons of this computer
 
+            begun = time.monotonic()
+
             def state() -> str:
                 is_alone = not (subscriber.connected or subscriber.order.keys)
-                return PARTS.join(["no daemon runs", *spoken]) if is_alone and spoken else subscriber.state()
+                return waiting_text(time.monotonic() - begun, spoken) if is_alone and spoken else subscriber.state()
 
             if as_json:
                 _stream(texts, subscriber, state, stopped)
@@ -413,6 +416,13 @@ def watch_reports(
                         table.add(text)
         finally:
             ended.set()
+
+
+def waiting_text(seconds: float, spoken: Iterable[str]) -> str:
+    """Return what is waited for since ``seconds`` while no daemon answers; ``spoken`` says of which one it was last."""
+    if seconds < FIRST_ANSWER:
+        return "looking for daemons of this computer ..."
+    return PARTS.join(["no daemon runs", *spoken])
 
 
 def _stream(
