@@ -31,7 +31,7 @@ def test_a_key_replaces_its_line_or_its_default() -> None:
     text = with_keys(TEXT, "parameters", {"R_a": NewLine("2.1 ohm", "new"), "L_a": NewLine({"value": "0.1 H"})})
     lines = text.splitlines()
     assert 'R_a = "2.1 ohm"  # new' in lines
-    assert 'L_a = { value = "0.1 H" }' in lines
+    assert 'L_a = { value = "0.1 H" }  # by a bridge' in lines
     kept = [line for line in TEXT.splitlines() if "R_a" not in line and "L_a" not in line]
     assert [line for line in lines if "R_a" not in line and "L_a" not in line] == kept
 
@@ -41,6 +41,31 @@ def test_a_new_key_is_the_last_of_its_table_and_a_new_table_the_last_of_the_file
         with_keys(TEXT, "noise", {"omega": NewLine("1 rad/s")}), "process_noise", {"i": NewLine("1 A/s^0.5")}
     )
     assert text.endswith('i = "5 mA"\nomega = "1 rad/s"\n\n[process_noise]\ni = "1 A/s^0.5"\n')
+
+
+COMMENTED = [
+    ('i = "5 mA"  # data sheet, page 3', "noise", "i"),
+    ('R_a = "6.5 ohm"     # by a bridge; at 20 °C', "parameters", "R_a"),
+    ("R_a = '6 # ohm' # by a bridge", "parameters", "R_a"),
+]
+
+
+@pytest.mark.parametrize(("row", "table", "name"), COMMENTED)
+def test_what_a_person_wrote_behind_a_replaced_value_stays(row: str, table: str, name: str) -> None:
+    written = row.rpartition("# ")[2]
+    text = f"[{table}]\n{row}\n"
+    for interval in ("± 0.2", "± 0.1", "± 0.1"):  # commissioned again: the interval of the value before goes
+        text = with_keys(text, table, {name: NewLine("7 V", f"of the machine: {interval}")})
+    new = f'{name} = "7 V"  # of the machine: ± 0.1  # {written}'
+    assert text == f"[{table}]\n{new}\n"
+
+
+@pytest.mark.parametrize("row", ['i = { column = "I", delay = "1 ms" }  # terminal 7', 'i = { column = "I" }  # terminal 7'])
+def test_a_delay_has_its_interval_beside_what_a_person_wrote(row: str) -> None:
+    text = f"[signals]\n{row}\n"
+    for interval in ("± 0.2 ms", "± 0.1 ms"):
+        text = with_delay(text, "i", "9.7 ms", interval)
+    assert text == '[signals]\ni = { column = "I", delay = "9.7 ms" }  # ± 0.1 ms  # terminal 7\n'
 
 
 @pytest.mark.parametrize("name", ["V_a", "i", "omega", "T_load"])

@@ -20,6 +20,8 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 
 HEADER = re.compile(r"\s*\[\[?([^\]]*)\]\]?\s*(?:#.*)?")
+FORMER = re.compile(r"(?:^#|:) ± ")  # In a remark that was written here: the interval of the value before
+BESIDE = "  # "  # Between a remark and what a person wrote behind the value
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +39,9 @@ class Unchangeable(ValueError):  # noqa: N818 - it is told as part of another er
 def with_keys(text: str, table: str, lines: Mapping[str, NewLine]) -> str:
     """Return the file with keys of a table, which is added at the end if it is missing.
 
-    A key replaces its line, or the one with ``#`` that has its default. A table that is there keeps its keys, and gets
-    those that it lacks. Raises Unchangeable.
+    A key replaces its line, or the one with ``#`` that has its default. What a person wrote behind a replaced value
+    stays there, after the remark. A table that is there keeps its keys, and gets those that it lacks. Raises
+    Unchangeable.
     """
     rows = text.split("\n")
     wanted = copy.deepcopy(tomllib.loads(text))
@@ -76,6 +79,7 @@ def with_delay(text: str, signal: str, delay: str, remark: str) -> str:
         if not _is_key(rows[number], signal):
             continue
         changed = re.sub(r"(\bdelay\s*=\s*)(\"[^\"]*\"|'[^']*'|[^,}\s]+)", rf"\g<1>{toml_value(delay)}", rows[number])
+        changed = _remarked(changed, remark)
         trial = "\n".join([*rows[:number], changed, *rows[number + 1 :]])
         if _parsed(trial) == wanted:
             return trial
@@ -113,15 +117,20 @@ def write_machine_file(file: Path, text: str) -> None:
 
 def _with_key(rows: list[str], table: str, name: str, line: NewLine) -> list[str]:
     end_of_line = "\r" if rows[0].endswith("\r") else ""  # rows are split at "\n"
-    new = f"{toml_key(name)} = {toml_value(line.value)}{_remark(line)}{end_of_line}"
+    new = _line(name, line) + end_of_line
     places = _inside(rows, table)
     if places is None:
         return [*_without_blank_end(rows), end_of_line, f"[{table}]{end_of_line}", new, ""]
     same = [number for number in places if _is_key(rows[number], name)]
     default = [number for number in places if _is_key(rows[number].lstrip().removeprefix("#"), name)]
-    if same or default:
-        number = (same or default)[0]
-        return [*rows[:number], new, *rows[number + 1 :]]
+    if same:
+        number = same[0]
+        before = rows[number].rstrip()
+        at = _comment_at(before)
+        comment = "" if at is None else f"  {before[at:]}"
+        return [*rows[:number], _line(name, line, comment) + end_of_line, *rows[number + 1 :]]
+    if default:
+        return [*rows[: default[0]], new, *rows[default[0] + 1 :]]
     filled = [number for number in places if rows[number].strip()]
     end = (filled[-1] if filled else places.start - 1) + 1
     return [*rows[:end], new, *rows[end:]]
@@ -134,8 +143,7 @@ def _with_more(rows: list[str], table: str, name: str, line: NewLine, wanted: Ma
         row = rows[number]
         for match in re.finditer(r"\}", row) if _is_key(row, name) else ():
             head, rest = row[: match.start()].rstrip().removesuffix(","), row[match.start() :]
-            end = rest if "#" in rest else f"{rest.rstrip()}{_remark(line)}{rest[len(rest.rstrip()) :]}"
-            trial = [*rows[:number], f"{head}, {keys} {end}", *rows[number + 1 :]]
+            trial = [*rows[:number], _remarked(f"{head}, {keys} {rest}", line.remark), *rows[number + 1 :]]
             if _parsed("\n".join(trial)) == wanted:
                 return trial
     own = rows
@@ -145,8 +153,32 @@ def _with_more(rows: list[str], table: str, name: str, line: NewLine, wanted: Ma
     return own
 
 
-def _remark(line: NewLine) -> str:
-    return f"  {toml_comment(line.remark)}" if line.remark else ""
+def _line(name: str, line: NewLine, comment: str = "") -> str:
+    return _remarked(f"{toml_key(name)} = {toml_value(line.value)}{comment}", line.remark)
+
+
+def _remarked(row: str, remark: str) -> str:
+    """Return a row that ends with a remark; what a person wrote behind the value follows it."""
+    whole = row.rstrip()
+    if not remark:
+        return row
+    at = _comment_at(whole)
+    value, comment = (whole, "") if at is None else (whole[:at].rstrip(), whole[at:])
+    return f"{value}  {toml_comment(remark)}{_of_person(comment, remark)}{row[len(whole) :]}"
+
+
+def _of_person(comment: str, remark: str) -> str:
+    """Return a comment without the remark that an earlier value got here."""
+    first, sign, rest = comment.partition(BESIDE)
+    is_former = not first or FORMER.search(first) or first == toml_comment(remark)
+    return f"{sign}{rest}" if is_former else f"  {comment}"
+
+
+def _comment_at(row: str) -> int | None:
+    """Return where the comment of a row begins: the first ``#`` outside of a text."""
+    outside = re.match(r"""(?:[^#"']|"(?:[^"\\]|\\.)*"|'[^']*')*""", row)
+    at = outside.end() if outside else 0
+    return at if row[at : at + 1] == "#" else None
 
 
 def _without_blank_end(rows: list[str]) -> list[str]:
