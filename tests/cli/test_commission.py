@@ -4,6 +4,7 @@ import os
 import tomllib
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -13,7 +14,7 @@ from otolith.cli.commissioning import noise
 from otolith.cli.commissioning.noise import UnusableData
 from otolith.cli.main import cli
 from otolith.commissioning import own_values
-from otolith.commissioning.own_values import OwnValue, OwnValues
+from otolith.commissioning.value_search import OwnValue, OwnValues
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded, replay_recorder
 from otolith.storage.history import describe_machine, history_directory
@@ -137,9 +138,9 @@ def with_limits(file: Path) -> str:
     return text
 
 
-def found(monkeypatch: pytest.MonkeyPatch, value: float, cost: float = 1.0) -> None:
-    """Let the data show ``value`` for R_a."""
-    values = OwnValues((OwnValue("R_a", value, 0.01),), {}, cost, 4)
+def found(monkeypatch: pytest.MonkeyPatch, value: float, share: float = 1.0, faults: tuple[str, ...] = ()) -> None:
+    """Let the data show ``value`` for R_a, and a ``share`` of the variance of the speed."""
+    values = OwnValues((OwnValue("R_a", value, 0.01),), {}, 1.0, 4, {"omega": share}, 1.0, faults=faults)
     monkeypatch.setattr(own_values, "own_values", lambda *_: values)
 
 
@@ -158,15 +159,19 @@ def test_values_that_are_written_leave_the_limits_of_a_person(ran: Path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("value", "cost", "words"),
-    [(3.0, 1.0, ("parameters.R_a", "3 ohm", "4", "low")), (6.6, 1e3, ("dc_motor", "1e+03", "[signals]"))],
-    ids=["outside the bounds of the file", "not described by the twin"],
+    ("shown", "words"),
+    [
+        ((3.0, 1.0), ("parameters.R_a", "3 ohm", "4", "low")),
+        ((6.6, 0.5), ("dc_motor", "omega", "50%", "90%", "[signals]")),
+        ((6.6, 1.0, ("other sign of T_load",)), ("no value is written", "other sign of T_load", "[signals]")),
+    ],
+    ids=["outside the bounds of the file", "not described by the twin", "a contradiction"],
 )
 def test_values_that_cannot_be_taken_end_it(
-    value: float, cost: float, words: tuple[str, ...], ran: Path, monkeypatch: pytest.MonkeyPatch
+    shown: tuple[Any, ...], words: tuple[str, ...], ran: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = with_limits(ran)
-    found(monkeypatch, value, cost)
+    found(monkeypatch, *shown)
     with raises_saying(ConfigurationError, *words):
         otolith("commission", ran, *SPAN, "--windows", "4", "--write")
     assert ran.read_text(encoding="utf-8") == text

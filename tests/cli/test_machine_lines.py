@@ -60,7 +60,9 @@ def test_what_a_person_wrote_behind_a_replaced_value_stays(row: str, table: str,
     assert text == f"[{table}]\n{new}\n"
 
 
-@pytest.mark.parametrize("row", ['i = { column = "I", delay = "1 ms" }  # terminal 7', 'i = { column = "I" }  # terminal 7'])
+@pytest.mark.parametrize(
+    "row", ['i = { column = "I", delay = "1 ms" }  # terminal 7', 'i = { column = "I" }  # terminal 7']
+)
 def test_a_delay_has_its_interval_beside_what_a_person_wrote(row: str) -> None:
     text = f"[signals]\n{row}\n"
     for interval in ("± 0.2 ms", "± 0.1 ms"):

@@ -176,12 +176,14 @@ def echo_warnings(data: Path, lines: Iterable[str]) -> None:
     echo(*(f"{data}: {line}" for line in lines), err=True)
 
 
-def local_time(seconds: float) -> str:
-    """Unix ``seconds`` as date and time of this computer's time zone, with its name."""
-    try:
-        return time.strftime("%F %T %Z", time.localtime(seconds))
-    except (ValueError, OverflowError, OSError):
-        return f"{seconds:g} s"  # no clock has such a time, but a file may
+def local_time(seconds: float, zone: str | None) -> str:
+    """Unix ``seconds`` as date and time in the zone of a machine, with its name; without one in that of this computer.
+
+    Every command tells times by it.
+    """
+    from otolith.health.times import moment_text
+
+    return moment_text(seconds, zone)
 
 
 def shipped_directory(name: str) -> Path:

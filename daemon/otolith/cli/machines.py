@@ -173,6 +173,25 @@ def _demos() -> "list[HistoryReader]":
     return [HistoryReader(path) for path in sorted(paths)]
 
 
+def zone_of_machine(text: str) -> str | None:
+    """Return the zone in which people read the times of a machine, given by its file or name.
+
+    None for that of this computer: nothing is known of the machine, or it has no zone.
+    """
+    from otolith.cli.operation.history import texts_and_zone
+
+    try:
+        return texts_and_zone(reader_of(text))[1] if text and not is_file(text) else _zone_of_file(Path(text))
+    except (ConfigurationError, OSError, ValueError):
+        return None
+
+
+def _zone_of_file(path: Path) -> str | None:
+    table = tomllib.loads(path.read_text(encoding="utf-8")).get("machine", {})
+    zone = table.get("timezone") if isinstance(table, dict) else None
+    return zone if isinstance(zone, str) else None
+
+
 def _described_file(reader: "HistoryReader") -> Iterator[Path]:
     """Yield the machine file that a daemon was started with, if it is still that of its machine."""
     try:

@@ -37,6 +37,7 @@ MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the
 
 UNOBSERVABLE = "its delay cannot be identified: it does not move, or no output depends on it"
 NO_DELAY = "no delay is significant; up to about {:.2g} ms could not be detected"
+REFERENCE = "the delays of the other signals are against it"
 AT_LIMIT = "at the largest delay that was searched"
 NO_WINDOW = "no window can be used: no delay was identified"
 CHANGING = 'it changes between its samples: add times = "polled" to it in [signals]'
@@ -384,8 +385,8 @@ class _Search:
                 at_limit = abs(point.delays[index]) >= self._limit
                 results.append(SignalDelay(name, value, sd, AT_LIMIT if at_limit else ""))
                 continue
-            if len(active) == len(self.names) - 1:  # the delays of all others are against this one
-                results.append(SignalDelay(name, value))
+            if active and index == least and (index in active or len(active) == len(self.names) - 1):
+                results.append(SignalDelay(name, value, None, REFERENCE))
                 continue
             undetected = float(np.sqrt(self._threshold * self._own_variance(point, active, index)))
             if undetected > MAX_UNCERTAINTY * self._limit * QUANTILE:

@@ -39,6 +39,16 @@ def local_moment(seconds: float, zone: str | None = None) -> datetime:
     return datetime.fromtimestamp(seconds, UTC).astimezone(own)
 
 
+def date_seconds(date: datetime, zone: str | None = None) -> float:
+    """Return the Unix time of a date; one without a zone is in ``zone`` or, as with :func:`local_moment`, in ours."""
+    if date.tzinfo is None and zone:
+        try:
+            return date.replace(tzinfo=zone_named(zone)).timestamp()
+        except (ValueError, OSError, KeyError):
+            return date.timestamp()
+    return date.timestamp()
+
+
 def utc_seconds(text: str) -> float:
     """Return the Unix time of a date in UTC; raise ValueError if it is none."""
     return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()

@@ -1,6 +1,5 @@
 """``otolith commission`` and ``baseline``: what is normal for a machine, from a log of it or while its daemon runs."""
 
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from otolith.cli.commissioning.noise import HealthyData
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise
-    from otolith.commissioning.own_values import OwnValues
+    from otolith.commissioning.value_search import OwnValues
     from otolith.health.labels import TimeLabels
     from otolith.health.prognosis import Baseline, History
     from otolith.machine import LoadedMachine
@@ -89,11 +88,12 @@ def commission(
     if data is not None:
         commission_log(file, data, windows, decide=(lambda: True) if yes else ask_if_healthy, write=write)
         return
-    end = until.before(time.time()) if until else time.time()
-    begin = (last or since or Since()).before(end if last else time.time())
-    if begin >= end:
-        raise click.UsageError(f"it begins at {local_time(begin)}, but ends at {local_time(end)}")
     machine, store = loaded(file)
+    zone = machine.plan.timezone
+    end = until.before(time.time(), zone) if until else time.time()
+    begin = (last or since or Since()).before(end if last else time.time(), zone)
+    if begin >= end:
+        raise click.UsageError(f"it begins at {local_time(begin, zone)}, but ends at {local_time(end, zone)}")
     _commission_running(
         machine, store, (begin, end), windows, decide=(lambda: True) if yes else ask_if_healthy, write=write
     )
@@ -132,12 +132,10 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
     with progress_line("reading") as show:
         chosen = good_windows(machine, data, windows)
         found = own_values(machine.problem, chosen, free, loads, show)
-    if not found.is_followed:
-        left = f"it leaves {found.cost:.3g} times the noise" if math.isfinite(found.cost) else "no value is determined"
-        remedy = "check units and signs in [signals]; 'otolith twin list' shows other twins"
-        raise ConfigurationError(
-            f"{data.path}: twin {machine.twin.name!r} does not describe the machine: {left}: {remedy}"
-        )
+    if found.faults or not found.is_followed:
+        raise ConfigurationError(f"{data.path}: no value is written: {_refusal(machine, found)}")
+    if found.beside:
+        echo(f"the log shows {', '.join(found.beside)}, which the twin lacks: fitted with the values", err=True)
     lines, remarks = _value_lines(machine, found, data.path)
     echo(*remarks, err=True)
     rest = [f"{row.name} = {row.nominal:.4g} {row.unit} ({row.meaning})" for row in rows if row not in free]
@@ -145,6 +143,22 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
         echo(f"of the design, as in the twin's example: {', '.join(rest)}: write what your machine has", err=True)
     echo(f"{machine.path}: {counted(len(lines), 'value')} written into [parameters]", err=True)
     return _written(machine, lambda text: with_keys(text, "parameters", lines))
+
+
+def _refusal(machine: "LoadedMachine", found: "OwnValues") -> str:
+    """Return why no value can be taken, and what to do."""
+    from otolith.commissioning.value_search import MIN_SHARE
+
+    check = "check columns, units and signs in [signals]"
+    if found.is_followed:
+        record = "or record the machine without what the twin lacks, as an unbalance or a load without a sensor"
+        return f"{'; '.join(found.faults)}: {check}, {record}"
+    least = min(found.shares.items(), key=lambda item: item[1], default=None)
+    left = "no value is determined"
+    if least is not None and least[1] < MIN_SHARE:
+        left = f"it explains {max(least[1], 0.0):.0%} of the variance of {least[0]}, of at least {MIN_SHARE:.0%}"
+    why = "; ".join(found.faults) or f"twin {machine.twin.name!r} does not describe the machine: {left}"
+    return f"{why}: {check}; 'otolith twin list' shows other twins"
 
 
 def _stated(machine: "LoadedMachine") -> set[str]:
@@ -161,23 +175,22 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
     lines, remarks = dict[str, NewLine](), list[str]()
     for item in found.values:
         row = machine.twin.parameter(item.name)
-        if item.sd is None and not item.is_taken:
+        if item.sd is None:
             stays = f"it stays {row.nominal:.4g} {row.unit} of the twin's example: write that of the data sheet"
             remarks.append(f"{row.name} ({row.meaning}): {item.remark}; {stays}")
             continue
-        if item.sd is None:
-            remark = item.remark
-            remarks.append(f"{row.name} = {item.value:.4g} {row.unit}, {item.remark}")
-        else:
-            remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, from {data.name}"
-            remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({row.meaning})")
+        origin = item.remark or f"from {data.name}"
+        remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, {origin}"
+        said = item.remark if item.is_taken else row.meaning
+        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({said})")
         value = written_value(machine, row, item.value, _bounds(row, item.value))
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
         row, largest = machine.twin.parameter(name), max(abs(low), abs(high))
         if largest > LOAD_SHARE * max(abs(row.low), abs(row.high)):
             ends = (0.0 if row.low >= 0.0 else -REACH * largest, 0.0 if row.high <= 0.0 else REACH * largest)
-            lines[name] = NewLine(written_value(machine, row, 0.5 * (low + high), ends), row.meaning)
+            remark = f"{row.meaning}: {low:.3g} to {high:.3g} {row.unit} in {data.name}"
+            lines[name] = NewLine(written_value(machine, row, 0.5 * (low + high), ends), remark)
     return lines, remarks
 
 
@@ -228,7 +241,7 @@ def _with_noise_and_delays(
     from otolith_drivers.errors import counted
 
     tables = {name: {key: NewLine(value, remark) for key, value, remark in rows}
-              for name, rows in level_rows(machine, identified).items()}  # fmt: skip
+              for name, rows in level_rows(machine, identified, is_written=True).items()}  # fmt: skip
     late = [item for item in delays.signals if item.is_late and item.sd is not None]
 
     def changed(text: str) -> str:
@@ -414,8 +427,9 @@ def _commission_running(
 
     names = machine.file.machine
     reader, data = HistoryReader(history_path(names.site, names.name)), HealthySpan(machine, *span)
-    echo(f"from {local_time(span[0])} to {local_time(span[1])}", err=True)
-    _warn_of_events(reader, span)
+    zone = machine.plan.timezone
+    echo(f"from {local_time(span[0], zone)} to {local_time(span[1], zone)}", err=True)
+    _warn_of_events(reader, span, zone)
     before = machine
     try:
         if write:
@@ -445,13 +459,13 @@ def _commission_running(
     echo("a running daemon takes the baseline over with its next window", err=True)
 
 
-def _warn_of_events(reader: "HistoryReader", span: tuple[float, float]) -> None:
+def _warn_of_events(reader: "HistoryReader", span: tuple[float, float], zone: str | None) -> None:
     """Name what the daemon announced in the time that is said to be healthy."""
     from otolith.health.limits import Level
 
     begin, end = span
     parts = {
-        f"{row.part or 'machine'} {row.state} at {local_time(row.entered)}"
+        f"{row.part or 'machine'} {row.state} at {local_time(row.entered, zone)}"
         for row in reader.states(begin)
         if row.state in (Level.WATCH, Level.ACT) and begin <= row.entered <= end
     }
@@ -557,7 +571,7 @@ def _baseline_lines(machine: "LoadedMachine", labels: "TimeLabels", name: str, i
 
     row = machine.plan.parameters[name]
     text, end = interval_text(item.value, item.sd, row.unit), labels.unix(item.end)
-    yield f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end)}"
+    yield f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end, machine.plan.timezone)}"
     level, limit = row.level(item.value, item.sd, Level.OK)
     if limit is not None:
         beyond = f"{level} {limit.side} {quantity_text(limit.value, row.unit)}"

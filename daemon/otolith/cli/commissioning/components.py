@@ -59,7 +59,7 @@ def list_(file: Path, as_json: bool) -> None:
         echo_json({"components": rows, **keys})
         return
     for record in records:
-        onset, decision = local_time(record.adopted.onset), _decision(record, decisions)
+        onset, decision = local_time(record.adopted.onset, machine.plan.timezone), _decision(record, decisions)
         echo(f"{key_of_record(record)}  {equation_of(machine, record)}  since {onset}  {decision}")
     for key in sorted(decisions.rejected - {key_of_record(record) for record in records}):
         echo(f"{key}  rejected: not searched for")

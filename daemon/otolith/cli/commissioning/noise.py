@@ -96,15 +96,15 @@ class HealthySpan:
         from otolith.storage.recording_files import recording_file
         from otolith_drivers.replay.span import SpanReader
 
-        names = machine.file.machine
+        names, zone = machine.file.machine, machine.plan.timezone
         known = [recording_file(path) for path in self.path.glob("*.rrd")]
         own = [file for file in known if file is not None and file.key == f"{names.site}.{names.name}"]
         files = [(file.begin, file.path) for file in own if file.begin <= self.end and file.end >= self.begin]
         if not files:
             newest = max((file.end for file in own), default=None)
-            until = "there is none of it" if newest is None else f"what is written ends at {local_time(newest)}"
+            until = "there is none of it" if newest is None else f"what is written ends at {local_time(newest, zone)}"
             remedy = "some minutes are written at a time, and [recording] says for how long they are kept"
-            span = f"from {local_time(self.begin)} to {local_time(self.end)}"
+            span = f"from {local_time(self.begin, zone)} to {local_time(self.end, zone)}"
             raise ConfigurationError(f"{self.path}: no recording of {names.name} {span}: {until}: {remedy}")
         return SpanReader(open_recordings(machine, [path for _, path in sorted(files)]), self.begin, self.end)
 
@@ -183,14 +183,30 @@ def good_windows(machine: "LoadedMachine", data: HealthyData, count: int) -> lis
     return chosen
 
 
-def level_rows(machine: "LoadedMachine", identified: "IdentifiedNoise") -> dict[str, list[tuple[str, str, str]]]:
-    """Return what belongs into the tables [noise] and [process_noise]: keys, values and remarks."""
-    twin = machine.twin
-    rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
-    inputs = zip(twin.inputs, identified.applied(machine.problem).levels, strict=False)
-    rows += [_input_row(machine, identified, source, level) for source, level in inputs if level]
-    states = [_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states]
-    return {"noise": rows, "process_noise": states}
+def level_rows(
+    machine: "LoadedMachine", identified: "IdentifiedNoise", *, is_written: bool = False
+) -> dict[str, list[tuple[str, str, str]]]:
+    """Return what belongs into the tables [noise] and [process_noise]: keys, values and remarks.
+
+    What ``is_written`` into a file has no level that the data do not determine: it is the one of the file.
+    """
+    twin, problem = machine.twin, machine.problem
+    outputs = zip(identified.outputs, problem.noise, strict=True)
+    states = zip(identified.states, problem.process_noise or (0.0,) * len(twin.states), strict=True)
+    inputs = zip(twin.inputs, identified.applied(problem).levels, strict=False)
+    shown = {source.name for source in identified.inputs if source.is_significant}
+
+    def is_row(level: "NoiseLevel", before: float) -> bool:
+        return not is_written or level.sd is not None or level.value != before
+
+    rows = [_row(level, twin.unit_of(level.name)) for level, before in outputs if is_row(level, before)]
+    rows += [
+        _input_row(machine, identified, source, level)
+        for source, level in inputs
+        if level and (not is_written or source.name in shown)
+    ]
+    process = [_row(own, f"{twin.unit_of(own.name)}/s^0.5") for own, before in states if is_row(own, before)]
+    return {"noise": rows, "process_noise": process}
 
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
@@ -291,10 +307,10 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
 
     A machine file that describes its signals has the table already, so the lines are comments.
     """
-    late = [signal for signal in delays.signals if signal.is_late]
+    late = [signal for signal in delays.signals if signal.is_late and signal.sd is not None]
     rows = []
     for late_signal in late:
-        uncertainty = f"± {2e3 * late_signal.sd:.2g} ms" if late_signal.sd is not None else ""
+        uncertainty = f"± {2e3 * (late_signal.sd or 0.0):.2g} ms"
         value = {"delay": f"{1e3 * late_signal.value:.4g} ms"}
         rows.append((late_signal.name, value, "; ".join(filter(None, [uncertainty, late_signal.remark]))))
     if late and machine.file.read_signals:
@@ -303,7 +319,7 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
     elif late:
         yield "[signals]"
         yield from _aligned(rows)
-    yield from (f"# {item.name}: {item.remark}" for item in delays.signals if item.remark and not item.is_late)
+    yield from (f"# {item.name}: {item.remark}" for item in delays.signals if item.remark and item not in late)
 
 
 def _row(level: "NoiseLevel", unit: str) -> tuple[str, str, str]:

@@ -13,7 +13,7 @@ import click
 
 from otolith.cli.common import AS_JSON, local_time
 from otolith.cli.machines import reader_of
-from otolith.cli.operation.history import SPANS
+from otolith.cli.operation.history import SPANS, texts_and_zone
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.outside_text import SURROGATE
 
@@ -92,7 +92,7 @@ def list_(machine: str, as_json: bool) -> None:
     for item in rows:
         echo(_key(item), f"  {event_text(item, details=True)}")
     for key in known.shelves.keys() - {_key(item) for item in rows}:
-        until = local_time(known.labels.unix(known.shelves[key].note.until or 0.0))
+        until = local_time(known.labels.unix(known.shelves[key].note.until or 0.0), known.zone)
         echo(key, f"  no event is open; one that begins is shelved until {until}")
     if not rows:
         echo(f"{known.machine}: no event is open", err=True)
@@ -179,6 +179,7 @@ class _Known:
     labels: "TimeLabels"
     taken: frozenset[str]  # Ids of the notes that the daemon has saved
     shelves: "Mapping[str, Shelf]"  # That it has saved, by what they are about
+    zone: str | None  # Of its times
 
 
 def _known(machine: str) -> _Known:
@@ -197,7 +198,8 @@ def _known(machine: str) -> _Known:
         events |= {item.id: item for item in learned.health.open_events if item.id not in events}
         labels = learned.clock.labels if not has_history and learned.clock is not None else labels
     taken, shelves = (learned.health.taken, learned.health.shelves) if learned else ((), {})
-    return _Known(reader.machine, file, events, labels, frozenset(taken), shelves)
+    zone = texts_and_zone(reader)[1] if has_history else next((row.timezone for row in events.values()), None)
+    return _Known(reader.machine, file, events, labels, frozenset(taken), shelves, zone)
 
 
 def _key(item: "EventDocument") -> str:
@@ -235,7 +237,7 @@ def _do(
     if note.deed is Deed.UNSHELVE and not is_shelved:
         raise ConfigurationError(f"event {item.id} is not shelved: 'otolith event list' shows what is")
     if item.end is not None and note.deed in (Deed.ACKNOWLEDGE, Deed.SHELVE):
-        end = local_time(known.labels.unix(item.end))
+        end = local_time(known.labels.unix(item.end), known.zone)
         raise ConfigurationError(f"event {item.id} ended at {end}: only 'otolith event comment' is possible")
 
     def changed(decisions: "OperatorDecisions") -> "OperatorDecisions":
@@ -261,7 +263,7 @@ def _print(known: _Known, item: "EventDocument", note: "OperatorNote", *, as_jso
         rest: dict[str, Any] = document.model_dump(exclude_none=True)
         echo_json({"event": item.id, "deed": note.deed, **rest, "daemon": is_running})
     else:
-        until = "" if document.until is None else f" until {local_time(document.until)}"
+        until = "" if document.until is None else f" until {local_time(document.until, known.zone)}"
         echo(f"{DONE[note.deed]}{until} by {note.by}: {item.part}: {item.condition}")
     if not is_running:
         remedy = "start it with 'otolith run', or with systemctl if it is installed"

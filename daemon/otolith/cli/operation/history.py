@@ -44,22 +44,26 @@ FORGED = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeErro
 class Since:
     """Where a time begins: at a date, or so long before its end."""
 
-    date: float | None = None  # Unix s
+    date: datetime | None = None
     age: float = 0.0  # s
 
-    def before(self, end: float) -> float:
-        """Return the begin, in s as ``end``."""
-        return end - self.age if self.date is None else self.date
+    def before(self, end: float, zone: str | None) -> float:
+        """Return the begin, in s as ``end``; a date without a zone is in ``zone``, or in that of this computer."""
+        from otolith_drivers.common.time_zones import date_seconds
+
+        return end - self.age if self.date is None else date_seconds(self.date, zone)
 
 
 def age_or_date(_: click.Context, __: click.Parameter, text: str) -> Since:
-    """Return what ``text`` means: an age like ``30d``, or a date and time of this computer's zone."""
+    """Return what ``text`` means: an age like ``30d``, or a date and time of the machine's zone."""
     if match := re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip()):
         return Since(age=float(match[1]) * SPANS[match[2]])
     try:
-        return Since(datetime.fromisoformat(text).timestamp())
+        since = Since(datetime.fromisoformat(text))
+        since.before(0.0, None)
     except (ValueError, OverflowError) as error:
         raise click.BadParameter(f"{text!r}: write an age like 12h, 30d or 8w, or a date like 2026-01-31") from error
+    return since
 
 
 @click.command()
@@ -106,7 +110,7 @@ def history(
     reader = reader_of(machine)
     _check_names(names, reader.names())
     end = end_of(reader)
-    begin = since.before(end)
+    begin = since.before(end, texts_and_zone(reader)[1])
     events = [] if names and not only_events else reader.events(begin)
     if only_events and as_csv:
         _print_events(events)
@@ -232,7 +236,7 @@ def _print_table(
     from otolith.cli.operation.event_table import event_table, print_changes, print_findings
     from otolith.health.times import moment_text
 
-    console, (say, zone) = Terminal(highlight=True), _texts(reader)
+    console, (say, zone) = Terminal(highlight=True), texts_and_zone(reader)
     first = min((sample.time for sample in samples), default=since)
     values = say("values_per", interval=say.translated(interval)) if samples else ""
     begin = moment_text(max(first, since), zone)
@@ -256,7 +260,7 @@ def _print_table(
         echo("no values or events since then", err=True)
 
 
-def _texts(reader: "HistoryReader") -> "tuple[Texts, str | None]":
+def texts_and_zone(reader: "HistoryReader") -> "tuple[Texts, str | None]":
     """Return the texts in the language of the machine, and the zone of its times, as its last report has them."""
     from otolith.health.text import texts_in
 
@@ -325,7 +329,7 @@ def report(machine: str, since: Since, output: Path | None, opens: bool) -> None
         raise click.UsageError("--open needs a file: give another --output than '-'")
     reader, now = reader_of(machine), time.time()
     end = end_of(reader)
-    begin = since.before(end)
+    begin = since.before(end, texts_and_zone(reader)[1])
     if begin >= now:
         raise click.BadParameter("lies in the future", param_hint="'--since'")
     content = page_of(reader, begin, end)
@@ -395,7 +399,7 @@ def reproduce(bundle: Path, as_json: bool) -> int:
     state, count, last = read.state, len(read.windows), read.windows[-1].window
 
     def when(time: float) -> str:
-        return local_time(time + last.ahead)
+        return local_time(time + last.ahead, state.plan.timezone)
 
     span = read.windows[0].window.start, last.end
     tell(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(when, span))}")

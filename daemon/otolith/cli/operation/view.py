@@ -18,7 +18,7 @@ from typing import IO, BinaryIO
 import click
 
 from otolith.cli.common import DEMOS, SERVICES, local_time
-from otolith.cli.machines import is_file, key_of
+from otolith.cli.machines import is_file, key_of, zone_of_machine
 from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
@@ -65,15 +65,16 @@ def view(recording: str | None, since: Since | None, only_list: bool, live: bool
             raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
         return follow(lambda: path, web=web) if live else open_viewer([path], web=web)
     machine = key_of(recording) if recording and is_file(recording) else recording or ""
-    known, begin = Recordings.search(machine), since.before(time.time()) if since else None
+    known, zone = Recordings.search(machine), zone_of_machine(recording or "")
+    begin = since.before(time.time(), zone) if since else None
     files = [file for file in known.files if begin is None or file.end >= begin]
     if only_list:
         width = max((len(file.key) for file in files), default=0)
-        echo(*(_row(file, width) for file in files))
-        echo(*(known.unreadable if files else [known.none_text(begin)]), err=True)
+        echo(*(_row(file, width, zone) for file in files))
+        echo(*(known.unreadable if files else [known.none_text(begin, zone)]), err=True)
         return 0
     if not files:
-        raise ConfigurationError(known.none_text(begin))
+        raise ConfigurationError(known.none_text(begin, zone))
     if live:
         return follow(lambda: _newest(machine, files[0]), web=web)
     return open_viewer([file.path for file in (files[:1] if since is None else reversed(files))], web=web)
@@ -109,10 +110,10 @@ class Recordings:
             newest_first = machines or newest_first
         return cls(machine, (own, SERVICES), tuple(newest_first), tuple(unreadable))
 
-    def none_text(self, since: float | None) -> str:
+    def none_text(self, since: float | None, zone: str | None) -> str:
         """Return why there is nothing to open, and what to do."""
         of = f" of {self.machine}" if self.machine else ""
-        span = f" since {local_time(since)}" if since else ""
+        span = f" since {local_time(since, zone)}" if since else ""
         where = " and ".join(map(str, self.places))
         others = sorted({file.key for file in Recordings.search("").files if file.key}) if self.machine else []
         known = f"there are recordings of {some_names(others)}"
@@ -152,12 +153,12 @@ def unreadable_text(path: Path) -> str:
     return f"{path}: not readable for this user: join group {group}: {join}"
 
 
-def _row(file: RecordingFile, width: int) -> str:
+def _row(file: RecordingFile, width: int, zone: str | None) -> str:
     """Return the line of a list: end, length, size, machine, mark, path; the name has begin and machine, or neither."""
     minutes = f"{max(0.0, file.end - file.begin) / 60.0:.0f}" if file.key else "-"
     mark = "event" if file.is_marked else ""
     size = f"{file.size / MEGABYTE:8.1f} MB"
-    return f"{local_time(file.end)}  {minutes:>5} min  {size}  {file.key or '-':<{width}}  {mark:<5}  {file.path}"
+    return f"{local_time(file.end, zone)}  {minutes:>5} min  {size}  {file.key or '-':<{width}}  {mark:<5}  {file.path}"
 
 
 def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:

@@ -1,0 +1,316 @@
+"""The search for values of parameters that several windows show together."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.commissioning.identification import sample_noise, with_initial_noise
+from otolith.commissioning.likelihood import Progress, with_levels
+from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
+from otolith.estimation.evidence import DECISIVE, EXPLAINED
+from otolith.estimation.information import QUANTILE
+from otolith.estimation.minimisers import FitResult, gauss_newton
+from otolith.estimation.objective import Objective
+from otolith.estimation.problem import Problem
+from otolith.estimation.timing import delayable, largest_delay
+from otolith.twin.definition import Parameter
+from otolith_drivers.units import to_base
+
+# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
+STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would be a random walk
+STAGE_STEPS, LAST_STEPS = 12, 40  # of Gauss-Newton
+QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
+MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
+MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
+PHASES = 8  # of a sine that are tried in each window
+
+
+@dataclass(frozen=True, slots=True)
+class OwnValue:
+    """A parameter of the machine."""
+
+    name: str
+    value: float  # In the unit of the twin
+    sd: float | None = None  # None if it is not determined
+    remark: str = ""  # Why it is not determined, or what it is taken from
+    is_taken: bool = False  # Whether it is taken from another parameter
+
+
+@dataclass(frozen=True, slots=True)
+class OwnValues:
+    """What a record shows of the parameters that were free."""
+
+    values: tuple[OwnValue, ...]
+    loads: Mapping[str, tuple[float, float]]  # Smallest and largest value of each unknown that windows do not share
+    cost: float  # Root mean square of the residuals in units of the noise
+    windows: int
+    shares: Mapping[str, float] = field(default_factory=dict)
+    """Of the variance of each output that moves: what the twin explains without being corrected."""
+    quiet_cost: float = np.inf  # As ``cost``, of a fit with less process noise
+    misfits: tuple[float, ...] = ()  # (windows,) mean square of what the twin leaves without being corrected
+    faults: tuple[str, ...] = ()  # Why no value may be written
+    beside: tuple[str, ...] = ()  # Components that were fitted with the values
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether the twin describes the machine with these values."""
+        return self.windows > 0 and bool(np.isfinite(self.cost)) and min(self.shares.values(), default=0.0) >= MIN_SHARE
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the twin leaves no more than noise where it is hardly corrected."""
+        return self.is_followed and self.quiet_cost <= EXPLAINED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """What all windows are fitted with, and where the fit begins."""
+
+    problem: Problem
+    shared: Mapping[str, Sequence[int]]  # See SharedFit
+    parameters: Array  # (free,)
+    guesses: Sequence[Array]  # Of the windows; none before the first stage
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """What the last stage reached."""
+
+    values: dict[str, float]
+    sd: dict[str, float]
+    weakest: list[str] | None  # Parameters of the weakest direction, if it is not determined
+    cost: float
+    guesses: list[Array]  # Of the windows, with the parameters that were held
+    stage: _Stage
+
+
+class ValueSearch:
+    """A search for the values that all windows have in common."""
+
+    def __init__(self, problem: Problem, windows: Sequence[Window], loads: frozenset[str], progress: Progress) -> None:
+        self._problem, self._windows, self._loads, self._progress = problem, windows, loads, progress
+        self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
+        self._fixed: dict[str, str] = {}  # Not determined, and why
+        self._equal: dict[str, str] = {}  # Taken as equal to another one
+        self._last: _Fitted | None = None
+
+    def run(self) -> OwnValues:
+        """Fit, and hold what is not determined, until all others are."""
+        while True:
+            shared = self._shared()
+            if not shared:
+                return OwnValues(self._values({}, {}), {}, np.inf, len(self._windows))
+            self._last = fitted = self._fitted(shared)
+            if fitted.weakest is None:
+                break
+            self._hold(fitted.weakest, fitted.values, fitted.sd)
+        values, sd = fitted.values, fitted.sd
+        loads = {
+            name: (min(own), max(own))
+            for name in self._loads & self._places.keys()
+            if (own := [float(guess[self._places[name]]) for guess in fitted.guesses])
+        }
+        others, quiet_cost = self._quieter(fitted.stage)
+        spread = {name: float(np.hypot(sd[name], others[name] - value)) for name, value in values.items()}
+        shares, misfits = self._simulated(fitted.stage)
+        found = OwnValues(
+            self._values(values, spread), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits
+        )
+        return replace(found, faults=tuple(self._contradictions(values, others, spread)))
+
+    def _quieter(self, stage: _Stage) -> tuple[dict[str, float], float]:
+        """Return the values of a fit that trusts the twin more, and its cost.
+
+        Both fits have the same values but for noise if the twin lacks nothing (J. A. Hausman, Econometrica 46, 1978).
+        """
+        noise = tuple(QUIETER * level for level in stage.problem.process_noise)
+        quieter = replace(stage, problem=replace(stage.problem, process_noise=noise))
+        guesses, result, _ = self._fit(quieter, LAST_STEPS)
+        return {name: float(guesses[0][ats[0]]) for name, ats in stage.shared.items()}, _cost(result)
+
+    def _simulated(self, stage: _Stage) -> tuple[dict[str, float], tuple[float, ...]]:
+        """Return the explained share of the variance of each output that moves, and the mean square left by window.
+
+        Measurements do not correct the twin; the initial state of each window is the best one.
+        """
+        problem, free = replace(stage.problem, open_loop=True), len(stage.parameters)
+        names = [output.name for output in problem.base_model.outputs]
+        (squares, variance, counts), misfits = np.zeros((3, len(names))), list[float]()
+        for window, guess in zip(self._windows, stage.guesses, strict=True):
+            objective = Objective(problem, window, guess[:free], guess[free:])
+            errors, jacobian = objective.linearise(guess)
+            states = jacobian[:, free:]
+            errors = errors + states @ np.linalg.lstsq(states, -errors, rcond=None)[0]
+            by_output = errors.reshape(objective.measured.shape) ** 2
+            squares += by_output.sum(axis=0)
+            misfits.append(float(by_output.sum() / objective.count))
+            for at, (name, level) in enumerate(zip(names, problem.noise, strict=True)):
+                values = window.column(name)[~window.missing_in(name)]
+                variance[at] += float(((values - values.mean()) ** 2).sum()) / level**2 if len(values) else 0.0
+                counts[at] += len(values)
+        moves = variance > MOVING**2 * counts
+        shares = {name: float(1.0 - squares[at] / variance[at]) for at, name in enumerate(names) if moves[at]}
+        return shares, tuple(misfits)
+
+    def _contradictions(
+        self, values: Mapping[str, float], others: Mapping[str, float], spread: Mapping[str, float]
+    ) -> Iterator[str]:
+        """Yield the values that depend on how far the measurements correct the twin."""
+        for name, value in values.items():
+            size = size_of(SharedScale(self._problem.free[self._places[name]]), value)
+            if not name.startswith("_") and QUANTILE * spread[name] > DETERMINED * size:
+                unit = self._problem.free[self._places[name]].unit
+                yield f"{name} is {value:.3g} {unit}, but {others[name]:.3g} {unit} where measurements correct less"
+
+    def delays(self) -> Array:
+        """Return by how much the signals are late (s) where that shows beside the values; zeros where it does not."""
+        none = np.zeros(len(delayable(self._problem.base_model)))
+        if self._last is None:
+            return none
+        stage, cost = self._last.stage, self._last.cost
+        self._progress("delays of the signals")
+        largest = min(largest_delay(window.grid.length, window.sample_period) for window in self._windows)
+        _, result, together = self._fit(stage, LAST_STEPS, largest)
+        late = together.delays(result.guess)
+        is_shown = np.abs(late).max() < largest and self.gain(cost, _cost(result)) > DECISIVE
+        return late - np.median(late) if is_shown else none
+
+    def gain(self, before: float, after: float) -> float:
+        """Return by how much -2 log likelihood falls where the cost does; the level of the noise is free."""
+        count = sum(int(np.count_nonzero(~window.missing)) for window in self._windows)
+        return 2.0 * count * float(np.log(before / after)) if 0.0 < after < before else 0.0
+
+    def _shared(self) -> dict[str, list[int]]:
+        """Return the places of each parameter that is searched and the windows share."""
+        shared = {
+            name: [place]
+            for name, place in self._places.items()
+            if not ({name} & (self._loads | self._fixed.keys() | self._equal.keys()))
+        }
+        for name, other in self._equal.items():
+            shared[other].append(self._places[name])
+        return shared
+
+    def _hold(self, weakest: Sequence[str], values: Mapping[str, float], sd: Mapping[str, float]) -> None:
+        """Take one of the parameters that only together are determined as equal to another one, or as stated."""
+        parameters = self._problem.free
+        for name in weakest:
+            mine = parameters[self._places[name]]
+            for other in (item for item in values if item not in weakest):
+                is_determined = QUANTILE * sd[other] <= DETERMINED * abs(values[other])
+                if is_determined and are_alike(mine, parameters[self._places[other]]):
+                    self._equal[name] = other
+                    return
+        first, *others = weakest
+        remark = f"not determined beside {', '.join(others)}" if others else "the data do not show it"
+        self._fixed[first] = remark
+        for name in [name for name, other in self._equal.items() if other == first]:
+            del self._equal[name]
+            self._fixed[name] = remark
+
+    def _fitted(self, shared: Mapping[str, Sequence[int]]) -> _Fitted:
+        """Return what is reached through all stages with the ``shared`` parameters."""
+        problem = replace(
+            self._problem,
+            known=(*self._problem.known, *((name, self._nominal(name)) for name in self._fixed)),
+            free=tuple(row for row in self._problem.free if row.name not in self._fixed),
+        )
+        places = {row.name: at for at, row in enumerate(problem.free)}
+        moved = {name: [places[self._problem.free[at].name] for at in ats] for name, ats in shared.items()}
+        parameters = np.array([row.nominal for row in problem.free])
+        guesses: list[Array] = []
+        noise, walk = self._levels()
+        for share in STAGES:
+            self._progress(f"values of {len(shared)} parameters, stage {STAGES.index(share) + 1} of {len(STAGES) + 1}")
+            staged = with_levels(problem, np.concatenate([noise, share * walk]))
+            guesses, _, _ = self._fit(_Stage(staged, moved, parameters, guesses), STAGE_STEPS)
+            parameters = guesses[0][: len(parameters)]
+        self._progress(f"values of {len(shared)} parameters, last stage")
+        there = replace(problem, free=tuple(
+            replace(row, nominal=float(value)) for row, value in zip(problem.free, parameters, strict=True)
+        ))  # fmt: skip
+        there = with_initial_noise(there, self._windows)
+        guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), LAST_STEPS)
+        cost = _cost(result)
+        values = {name: float(guesses[0][ats[0]]) for name, ats in moved.items()}
+        sd, weakest = deviations(result, together, values, cost)
+        restored = [self._whole(guess, problem) for guess in guesses]
+        return _Fitted(values, sd, weakest, cost, restored, _Stage(there, moved, parameters, guesses))
+
+    def _fit(self, stage: _Stage, steps: int, largest: float = 0.0) -> tuple[list[Array], FitResult, SharedFit]:
+        """Fit all windows; the predictor is made around the guesses.
+
+        Delays of the signals up to the ``largest`` (s) are fitted as well.
+        """
+        objectives, free = [], len(stage.parameters)
+        for number, window in enumerate(self._windows):
+            before = stage.guesses[number] if stage.guesses else None
+            start = stage.parameters if before is None else before[:free]
+            objectives.append(Objective(stage.problem, window, start, None if before is None else before[free:]))
+        together = SharedFit(objectives, stage.shared, stage.problem, largest)
+        begin = list(stage.guesses) or [self._first_guess(objective, stage) for objective in objectives]
+        result = gauss_newton(together, together.joined(begin), steps)
+        return together.split(result.guess), result, together
+
+    def _first_guess(self, objective: Objective, stage: _Stage) -> Array:
+        """Return the guess of a window from the parameters; of each phase of its own, the best one that is tried."""
+        guess = objective.guess(stage.parameters)
+        names = [parameter.name for parameter in stage.problem.free]
+        for phase in (name for name in self._loads if name.startswith("_phase_")):
+            trials = np.repeat(guess[None], PHASES, axis=0)
+            trials[:, names.index(phase)] = 2.0 * np.pi * np.arange(PHASES) / PHASES - np.pi
+            left = [float((objective.linearise(trial)[0] ** 2).sum()) for trial in trials]
+            guess = trials[int(np.argmin(left))]
+        return guess
+
+    def _levels(self) -> tuple[Array, Array]:
+        """Return the noise of the outputs, and per square root of a second that of states which walk as they move."""
+        twin, period = self._problem.base_model, self._windows[0].sample_period
+        noise = [sample_noise(output.name, self._windows) or output.noise for output in twin.outputs]
+        noise = [
+            level if np.isfinite(level) else output.noise for level, output in zip(noise, twin.outputs, strict=True)
+        ]
+        stated = self._problem.process_noise or (0.0,) * len(twin.states)
+        outputs = {output.name for output in twin.outputs}
+        walk = []
+        for state, level in zip(twin.states, stated, strict=True):
+            if state.name in outputs:
+                steps = [np.diff(window.column(state.name)[~window.missing_in(state.name)]) for window in self._windows]
+                walk.append(float(np.sqrt(np.mean(np.concatenate(steps) ** 2) / period)))
+            else:
+                walk.append(level)
+        return np.array(noise), np.array(walk)
+
+    def _whole(self, guess: Array, problem: Problem) -> Array:
+        """Return the guess with the parameters that were held, at the places of all free ones."""
+        values = {row.name: float(value) for row, value in zip(problem.free, guess, strict=False)}
+        return np.array([values.get(row.name, row.nominal) for row in self._problem.free])
+
+    def _nominal(self, name: str) -> float:
+        return self._problem.free[self._places[name]].nominal
+
+    def _values(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[OwnValue, ...]:
+        rows = []
+        for name in self._places:
+            if name in self._loads:
+                continue
+            if name in self._equal:
+                other = self._equal[name]
+                rows.append(OwnValue(name, values[other], sd[other], f"taken as equal to {other}", is_taken=True))
+            elif name in self._fixed:
+                rows.append(OwnValue(name, self._nominal(name), None, self._fixed[name]))
+            else:
+                rows.append(OwnValue(name, values[name], sd[name]))
+        return tuple(rows)
+
+
+def _cost(result: FitResult) -> float:
+    return float(np.sqrt(result.chi_square / max(len(result.residuals), 1)))
+
+
+def are_alike(one: Parameter, other: Parameter) -> bool:
+    """Whether the example of the twin has both with the same value, bounds and dimension."""
+    numbers = [(row.nominal, row.low, row.high) for row in (one, other)]
+    return numbers[0] == numbers[1] and to_base(one.unit) == to_base(other.unit)
