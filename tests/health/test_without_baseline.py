@@ -20,7 +20,7 @@ from otolith.health.schema import (
     Severity,
     Status,
 )
-from otolith.health.text import headline
+from otolith.health.text import headline, value_cells
 from otolith.machine import LIBRARY, LoadedMachine, load_machine
 from otolith_drivers.grammars.toml_lines import toml_value
 from tests.health.test_events import report
@@ -102,12 +102,15 @@ def test_the_example_of_a_twin_is_no_baseline(change: float, tmp_path: Path) -> 
     assert document.health is not None
     assert {document.health.state, document.health.parts["bearing"].state} == {Level.NO_DATA}
     assert_says(headline(document.health), "no baseline", "otolith commission")
+    assert value_cells(document.parameters["D"])[-1] == ""
     known = with_baselines(machine.plan, baselines({"R_a": 6.5 * change, "D": 0.00143 * change}))
     well = shown(known, R_a=6.5 * change, D=0.00143 * change)
     assert well.health is not None
     assert {part.state for part in well.health.parts.values()} == {Level.OK}
     (event,) = shown(known, R_a=6.5 * change, D=0.00143 * change * 2.1).events
     assert event.state is Level.ACT
+    (other,) = (row for name, row in shown(known, R_a=6.5 * change, D=0.00286).parameters.items() if name == "D")
+    assert value_cells(other)[-1] == f"{2.0 / change - 1.0:+.2%}".replace("+0.00%", "0.00%")
 
 
 @pytest.mark.parametrize(

@@ -342,10 +342,14 @@ def _before_the_last_run(doubtful: tuple[int, ...], now: int) -> tuple[int, ...]
     return tuple(rest)
 
 
-def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
-    """Return the baseline of a parameter, its limit, and its value at the reference temperature if one is measured."""
+def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float | bool]:
+    """Return the baseline of a parameter, its limit, and its value at the reference temperature if one is measured.
+
+    Also whether its nominal value is of another machine.
+    """
     quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
-    judged = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    judged: dict[str, float | bool] = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    judged |= {"is_example": True} if quantity.waiting else {}
     if quantity.limits:
         worst = min(quantity.limits, key=lambda row: (-row.level.rank, abs(row.value - quantity.nominal)))
         judged["limit"] = worst.value

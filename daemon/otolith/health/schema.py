@@ -277,6 +277,7 @@ class ParameterDocument(DocumentModel):
     high: float | None = None
     nominal: float
     baseline: float | None = None  # Healthy value, to which limits in percent refer; None if they refer to nominal
+    is_example: bool | None = None  # True if nominal is of the twin's example, which is another machine; else None
     limit: float | None = None  # The nearest to the healthy value of the most severe limits; None without limits
     referred: float | None = None  # At the reference temperature, for the limits; None without a temperature
     raw: float | None = None  # Estimate of this window alone

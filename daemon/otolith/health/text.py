@@ -121,10 +121,14 @@ def value_text(parameter: ParameterDocument) -> str:
 
 
 def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
-    """The cells of a parameter in a table: value, half of the 95 % interval, unit, change against nominal."""
+    """The cells of a parameter in a table: value, half of the 95 % interval, unit, change.
+
+    The change is that against the baseline, or else the nominal value; empty if that is of another machine.
+    """
     if parameter.value is None or parameter.sd is None:
         return UNKNOWN, "", unit_text(parameter.unit), ""
-    change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
+    healthy = parameter.nominal if parameter.baseline is None else parameter.baseline
+    change = f"{parameter.value / healthy - 1:+.2%}" if healthy and not parameter.is_example else ""
     change = "0.00%" if change in ("-0.00%", "+0.00%") else change
     half = QUANTILE * parameter.sd
     scale = scale_of(parameter.value, parameter.unit, half)
