@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.special import chdtrc, chdtri
 
 from otolith.acquisition.window import Array
 from otolith.estimation.evidence import (
+    CHANCE,
     LogEvidence,
+    chi_square_limit,
     discount,
     likelihood_ratios,
     log_determinant,
@@ -62,3 +65,13 @@ def test_noise_is_not_discounted() -> None:
     assert discount(300.0, 400.0) == 1.0
     assert discount(400.0, 400.0) == 1.0
     assert discount(900.0, 400.0) == 2.25
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 4, 7, 12, 40, 99, 100])
+def test_the_limit_of_chi_square_is_exact_for_few_degrees_of_freedom(degrees: int) -> None:
+    assert chi_square_limit(degrees) == pytest.approx(float(chdtri(degrees, CHANCE)), rel=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [101, 400, 10_000, 1_000_000])
+def test_the_limit_of_chi_square_is_close_for_many(degrees: int) -> None:
+    assert 0.8 * CHANCE < float(chdtrc(degrees, chi_square_limit(degrees))) <= CHANCE

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
-from otolith.estimation.imm_filter import NIS_DEVIATE, nis_limit
+from otolith.estimation.evidence import CHANCE, chi_square_limit
 from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -49,7 +49,6 @@ MAX_FROZEN_SHARE = 0.05  # share of records above which the channel is rejected
 FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
 FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
 RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be distinguished from motion over coarse steps
-CHANCE = 1e-9  # probability of equal readings of a noisy sensor below which they are no chance
 PILE_WIDTH = 7.0  # standard deviations of the noise at a limit: range of a thousand normal values
 PILE_ROUNDS = 3  # of estimating this noise from the samples of the pile
 MIN_REPEATED_RUN = 10  # records
@@ -305,7 +304,7 @@ def _without_piles(channel: _Channel) -> tuple[Window, FaultySensor] | None:
     if not runs:
         return None
     records = np.concatenate(runs)
-    reduced, expected = channel.without(records), len(records) + NIS_DEVIATE * np.sqrt(2.0 * len(records))
+    reduced, expected = channel.without(records), chi_square_limit(len(records))
     noisier = _with_noise(problem, channel.index, max(level for _, _, level in piles))
     is_probable = _are_probable(channel, noisier, runs, reduced, expected)
     return None if is_probable else (reduced, _clipped_sensor(channel, runs))
@@ -415,7 +414,7 @@ def _is_probable(channel: _Channel, problem: Problem, reduced: Window, rounding:
     if not others.chi_square < PENALTY:
         return True  # a twin that diverges predicts nothing
     unknowns = len(problem.free) + len(problem.twin.states)
-    limit = others.chi_square + others.discount * (nis_limit(unknowns) + rounding)
+    limit = others.chi_square + others.discount * (chi_square_limit(unknowns) + rounding)
     starts = (others.parameters, predicted.start())  # either may lead into a local minimum
     chi_squares = (fit_predicted(predicted, problem, channel.window, start).chi_square for start in starts)
     return any(chi_square <= limit or not chi_square < PENALTY for chi_square in chi_squares)

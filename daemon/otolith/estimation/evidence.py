@@ -15,6 +15,9 @@ Where even the best alternative leaves more than the noise, what it leaves is no
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from math import erfc, exp, gamma, sqrt
+from statistics import NormalDist
 
 import numpy as np
 
@@ -23,6 +26,9 @@ from otolith.acquisition.window import Array
 # Thresholds: docs/reference/thresholds-estimation.md has the origin of each.
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
 EXPLAINED = 1.5  # RMSE in units of the noise up to which a residual counts as noise
+CHANCE = 1e-9  # probability of what noise alone does not do
+EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
+ROUNDING = 1e-12  # share of a limit up to which it is computed
 STRUCTURE = 1.5  # the same with the correlation of what is left: above it, there is more than noise
 NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 
@@ -59,6 +65,34 @@ def discount(chi_square: float, count: float) -> float:
     That is how many times the variance of the noise it leaves; at least one.
     """
     return max(chi_square / count, 1.0)
+
+
+@lru_cache(maxsize=256)
+def chi_square_limit(degrees: int) -> float:
+    """Return the χ² of so many degrees of freedom that noise alone exceeds with the probability ``CHANCE``.
+
+    For many degrees of freedom its cube root is normal (E. B. Wilson, M. M. Hilferty, PNAS 17, 1931), which is too
+    large for few.
+    """
+    spread = 2.0 / (9.0 * degrees)
+    high = degrees * (1.0 - spread - NormalDist().inv_cdf(CHANCE) * sqrt(spread)) ** 3
+    if degrees > EXACT_DEGREES:
+        return high
+    low = float(degrees)
+    while high - low > ROUNDING * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _upper_tail(middle, degrees) > CHANCE else (low, middle)
+    return high
+
+
+def _upper_tail(chi_square: float, degrees: int) -> float:
+    """Return the probability of a larger χ²: a finite sum (M. Abramowitz, I. A. Stegun, formulas 26.4.4 and 26.4.5)."""
+    half, is_odd = 0.5 * chi_square, degrees % 2
+    term, total = (exp(-half) * sqrt(half) / gamma(1.5), erfc(sqrt(half))) if is_odd else (exp(-half), 0.0)
+    for number in range(1, degrees // 2 + 1):
+        total += term
+        term *= half / (number + 0.5 * is_odd)
+    return total
 
 
 def is_explained(chi_square: float, count: float) -> bool:

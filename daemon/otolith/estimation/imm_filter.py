@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
-from otolith.estimation.evidence import likelihood_ratios, log_determinant
+from otolith.estimation.evidence import chi_square_limit, likelihood_ratios, log_determinant
 from otolith.estimation.information import Evidence
 
 TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
@@ -36,7 +36,6 @@ MAX_GAP = 1e7  # s between windows: the modes are stationary by then
 VARIANCE_RATIO_GAIN = 0.1  # share of the newest window in the variance ratio
 MAX_VARIANCE_RATIO = 1e4
 MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no further; also the unit of inflate_variance
-NIS_DEVIATE = 6.0  # of the standard normal distribution: exceeded by one healthy window in a thousand million
 MAX_PRECISION = 1e7  # of a window: prior standard deviations over its own, in the direction of which it states most
 SHIFT_REFERENCE = 1.0  # standard deviations: a window that shifts a parameter by less is evidence against a change
 LARGEST_SHARE = 0.6  # of the limit that one window adds at most: a wrong window alone does not reach it
@@ -193,7 +192,7 @@ class Innovation:
     @property
     def is_expected(self) -> bool:
         """Whether it is within what healthy windows reach."""
-        return self.nis <= nis_limit(float(len(self.sqrt_information)))
+        return self.nis <= chi_square_limit(len(self.sqrt_information))
 
     def inflate_variance(self, reduced_chi_square: float) -> "Innovation":
         """Return the same with a larger variance ratio, after a window that agreed with none before and none after it.
@@ -241,11 +240,6 @@ def shift_limit(sums: int) -> float:
     """
     exponent = np.log(2.0 * SHIFT_REFERENCE**2 * WINDOWS_PER_ALARM * max(sums, LEAST_SUMS))
     return float(exponent / (2.0 * SHIFT_REFERENCE) - OVERSHOOT)
-
-
-def nis_limit(degrees: float) -> float:
-    """Return the χ² that healthy windows do not exceed (E. B. Wilson, M. M. Hilferty, PNAS 17, 1931)."""
-    return float(degrees * (1.0 - 2.0 / (9.0 * degrees) + NIS_DEVIATE * np.sqrt(2.0 / (9.0 * degrees))) ** 3)
 
 
 def innovation_of(prediction: ImmPosterior, evidence: Evidence) -> Innovation:
