@@ -5,16 +5,20 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
+import pytest
+
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.discovery.decision import ACCEPTED, UPDATES, PosteriorUpdate, WindowDecision
+from otolith.estimation import data_checks
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin, load_machine
 from otolith.twin.kernel import Kernel
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario
+from tests.messages import assert_says
 
 CONFIG = Path(__file__).parents[2] / "config"
 Cut = Callable[..., list[tuple[Window, float]]]
@@ -85,3 +89,19 @@ def test_adapt_is_deterministic(scenario: MotorScenario, windows: Cut) -> None:
 def test_every_decision_has_an_update() -> None:
     assert set(UPDATES) == set(WindowDecision)
     assert {decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE} == ACCEPTED
+
+
+def test_of_a_window_that_memory_does_not_suffice_for_the_last_records_are_estimated_from(
+    scenario: MotorScenario, windows: Cut, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, last = healthy(scenario, windows)
+    assert last.records == 200
+    monkeypatch.setattr(data_checks, "MAX_RECORDS", 150)
+    after_part, of_part = adapt(state, last.since(50))
+    after_whole, of_whole = adapt(state, last)
+    (part,), (whole,) = of_part.document.parameters.values(), of_whole.document.parameters.values()
+    assert (whole.value, whole.sd) == (part.value, part.sd)
+    assert of_whole.document.window == of_part.document.window
+    assert (after_whole.posterior.prior().mean == after_part.posterior.prior().mean).all()
+    assert_says(whole.reason, "150", "200", "1.5 s", "length", "[window]", "sample_period")
+    assert not part.reason

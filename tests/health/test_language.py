@@ -111,6 +111,14 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
             "a signal is late: i is 5 ms late (4 to 6) (9%); write delay = 5 under [signals] i",
             "ein Signal kommt verspätet: i kommt 5 ms zu spät (4 bis 6) (9 %); delay = 5 eintragen unter [signals] i",
         ),
+        (
+            "only the last 3 of 4 records are estimated from, as more need too much memory",
+            "nur aus den letzten 3 von 4 Datensätzen wird geschätzt, da mehr zu viel Speicher brauchen",
+        ),
+        (
+            "write at most 2 s as length under [window], or a longer sample_period",
+            "unter [window] als length höchstens 2 s eintragen, oder eine längere sample_period",
+        ),
         ("5% of i is missing, more than missing_limit (1%)", "5% von i fehlen, mehr als missing_limit (1%)"),
         ("shaft: -0.004·sin(angle(omega)) N*m", "shaft: -0.004·sin(angle(omega)) N*m"),
         ("a sentence with {braces} of somebody", "a sentence with {braces} of somebody"),

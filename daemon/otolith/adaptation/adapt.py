@@ -38,7 +38,7 @@ from otolith.discovery.noise_hypothesis import likelier_levels_of, prior_inflati
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
-from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
+from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, last_records, without_saturated
 from otolith.estimation.imm_filter import Innovation, ParameterCusum
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
@@ -60,6 +60,7 @@ UNUSED = "nothing is estimated from this window: "
 
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
     """Return the state after ``window``, and the report of it."""
+    window, shortened = last_records(window)
     posterior = state.posterior.without_expired(window.start)
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
@@ -67,7 +68,7 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     bridged = with_changes_between(window, commands) if commands else window
     state, predicted, checked = _predict_and_check(state, bridged)
     result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
-    result = replace(result, notes=(*checked.notes, *(own.text for own in result.faulty_sensors)))
+    result = replace(result, notes=(*shortened, *checked.notes, *(own.text for own in result.faulty_sensors)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)

@@ -36,6 +36,7 @@ from otolith.twin.definition import Definition, Output
 from otolith_drivers.units import unit_text
 
 MIN_RECORDS = 5
+MAX_RECORDS = 30_000  # that are estimated from: a search for what the twin lacks takes 12 kB for each
 MAX_VALUE = 1e12  # magnitude of a value, in the unit of its signal
 SPIKE_HEIGHT = 12.0  # times the usual second difference of the channel: least height of a spike
 SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from that of a spike, which is a half at equal steps
@@ -88,6 +89,18 @@ class CheckedWindow:
     def is_usable(self) -> bool:
         """Whether the window may be estimated from."""
         return not self.bad and not self.faulty_sensors
+
+
+def last_records(window: Window) -> tuple[Window, tuple[str, ...]]:
+    """Return the window, or its last records if it has more than memory suffices for, and a note of that."""
+    if window.records <= MAX_RECORDS:
+        return window, ()
+    length = f"{MAX_RECORDS * window.sample_period:.3g} s"
+    note = (
+        f"only the last {MAX_RECORDS} of {window.records} records are estimated from, as more need too much memory; "
+        f"write at most {length} as length under [window], or a longer sample_period"
+    )
+    return window.since(window.records - MAX_RECORDS), (note,)
 
 
 def check_window(window: Window, predicted: Posterior) -> CheckedWindow:
