@@ -1,6 +1,7 @@
 """Shared fixtures: windows of a simulated plant without real time, and a machine file with free ports."""
 
 import atexit
+import os
 import socket
 import tempfile
 from collections.abc import Callable, Iterator
@@ -90,7 +91,14 @@ def runtime() -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def private_directories(tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Redirect state directory and sockets of the user. All tests share the compiled kernels."""
+    """Redirect home, state directory and sockets of the user, whose own daemons may run beside the tests.
+
+    All tests share the compiled kernels.
+    """
+    monkeypatch.setenv("XDG_CACHE_HOME", os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache"))
+    home = tmp_path.with_name(f"{tmp_path.name}-home")  # beside: tests list what is in their folder
+    home.mkdir(exist_ok=True)
+    monkeypatch.setenv("HOME", str(home))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     for name in ("RUNTIME_DIRECTORY", "STATE_DIRECTORY", "CACHE_DIRECTORY", "NOTIFY_SOCKET", "WATCHDOG_USEC"):

@@ -152,7 +152,12 @@ def _parameter(machine: LoadedMachine, parameter: Parameter, written: Any) -> It
     yield _header(("parameters", parameter.name))
     yield _prose(parameter.meaning)
     yield from _written(table)
-    yield from (_default(name, value) for name, value in defaults.items() if name not in table)
+    waits = bool({**machine.plan.known, **machine.plan.parameters}[parameter.name].waiting)
+    for name, value in defaults.items():
+        if name not in table:
+            # Written into the file, they would be those of this machine, and judged at once.
+            of_example = waits and name in {"value", "watch", "act"}
+            yield _prose(f"{name} = {value}, of the twin's example") if of_example else _default(name, value)
     yield ""
 
 
