@@ -326,9 +326,8 @@ def zone_of(document: ReportDocument) -> str | None:
 
 
 def brief(document: ReportDocument, when: Clock | None = None) -> str:
-    """A report in one line of at most :data:`LINE` characters: time, state, and the parameters that have room."""
-    texts = texts_in(document.health.language if document.health else "en")
-    state = "" if document.health is None else f" {texts.translated(document.health.state)}"
+    """A report in one English line of at most :data:`LINE` characters: time, state, the parameters that have room."""
+    state = "" if document.health is None else f" {texts_in('en').translated(document.health.state)}"
     when = when or clock_in(zone_of(document))
     line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
     values = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
