@@ -10,8 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.adaptation.state import apply_decisions, initial_state
+from otolith.cli.commissioning import commission as commission_module
 from otolith.cli.commissioning import noise
-from otolith.cli.commissioning.noise import UnusableData
+from otolith.cli.commissioning.commission import Manner
+from otolith.cli.commissioning.noise import HealthyLog, UnusableData
 from otolith.cli.main import cli
 from otolith.commissioning import own_values
 from otolith.commissioning.value_search import OwnValue, OwnValues
@@ -23,12 +25,13 @@ from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_value
 from otolith_drivers.plant.dc_motor import MotorScenario, SetPoint
+from otolith_drivers.plant.faults import Frozen
 from otolith_drivers.plant.scenario import simulate
 from tests.cli.commands import otolith, tables
 from tests.cli.replays import HEADING, MACHINE
 from tests.cli.test_init import UNITS_IN_THE_HEADER, german
 from tests.conftest import SIGNALS
-from tests.messages import assert_says, raises_saying
+from tests.messages import assert_each_says, assert_says, raises_saying
 
 BEGIN = 1_800_000_000.0  # Unix s
 WINDOWS, RECORDS, PERIOD = 25, 200, 0.01
@@ -68,19 +71,41 @@ def test_a_german_table_becomes_a_page_without_an_edit(tmp_path: Path, other: Mo
     assert "<html" in page.read_text(encoding="utf-8")
 
 
+def logged(data: Path, scenario: MotorScenario, windows: int = WINDOWS) -> None:
+    """Write a log of so many windows."""
+    ticks = islice(simulate(scenario), windows * RECORDS)
+    rows = [
+        ",".join([repr(BEGIN + PERIOD * index), *(repr(float(tick.measured[name])) for name in SIGNALS.values())])
+        for index, tick in enumerate(ticks)
+    ]
+    data.write_text("\n".join([",".join(HEADING), *rows, ""]), encoding="utf-8")
+
+
+@pytest.mark.parametrize("details", [False, True])
+def test_findings_of_the_replay_are_counted_or_printed(
+    details: bool, tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The current freezes at 6 s."""
+    file, data = tmp_path / "machine.toml", tmp_path / "samples.csv"
+    file.write_text(MACHINE.read_text(encoding="utf-8"), encoding="utf-8")
+    frozen = Frozen.model_validate({"kind": "frozen", "start": "6 s", "signal": "ArmatureCurrent"})
+    logged(data, scenario.model_copy(update={"faults": (frozen,)}), 14)
+    machine = load_machine(file, with_driver=False)
+    commission_module._replayed(machine, HealthyLog(data), Manner(lambda: None, details=details))
+    said = [line for line in capsys.readouterr().err.splitlines() if "window" in line]
+    if details:
+        assert len(said) > 1
+    else:
+        assert_each_says(said, ("14", "--details"))
+
+
 @pytest.fixture
 def ran(tmp_path: Path, scenario: MotorScenario) -> Path:
     """The file of a machine with state, history and recording of a daemon that ran for ``WINDOWS`` windows."""
     file, data = tmp_path / "machine.toml", tmp_path / "samples.csv"
     text = MACHINE.read_text(encoding="utf-8")
     file.write_text(text, encoding="utf-8")
-    healthy = scenario.model_copy(update={"faults": ()})
-    ticks = islice(simulate(healthy), WINDOWS * RECORDS)
-    rows = [
-        ",".join([repr(BEGIN + PERIOD * index), *(repr(float(tick.measured[name])) for name in SIGNALS.values())])
-        for index, tick in enumerate(ticks)
-    ]
-    data.write_text("\n".join([",".join(HEADING), *rows, ""]), encoding="utf-8")
+    logged(data, scenario.model_copy(update={"faults": ()}))
     machine = load_machine(file, with_driver=False)
     names = machine.file.machine
     folder = machine.recording_folder

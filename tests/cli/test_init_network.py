@@ -124,6 +124,21 @@ def test_a_displayed_value_without_a_register_is_named(held: dict[str, float]) -
         with_displays(shown, offers, [find_twin("dc_motor")])
 
 
+@pytest.mark.parametrize(
+    ("held", "unit", "scale"),
+    [(1450.0, "rpm", "1"), (1518.0, "rad/s", "0.1"), (2417.0, "turn/s", "0.01")],
+    ids=["as displayed", "in rad/s", "in turns a second"],
+)
+def test_a_register_may_hold_another_usual_unit_than_the_display_shows(held: float, unit: str, scale: str) -> None:
+    """1450 rpm are 151.8 rad/s."""
+    shown = Answers(displays={"V_a": "24.1 V", "i": "2.31 A", "omega": "1450 rpm"})
+    offers = [
+        Offer(name, None, {}, np.full(3, value)) for name, value in {"10": 241.0, "11": 2310.0, "12": held}.items()
+    ]
+    found = with_displays(shown, offers, [find_twin("dc_motor")])
+    assert (found.signals["omega"], found.units["12"], found.scales["12"]) == ("12", unit, scale)
+
+
 def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     browsed = []
 

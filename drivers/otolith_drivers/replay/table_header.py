@@ -198,13 +198,26 @@ def _columns(
     is_stated = False
     for signal, request in wanted.items():
         index, written = places[request.column]
-        unit = request.written or written or beside.get(index)
+        stated = written or beside.get(index)
+        unit = request.written or stated
         is_stated |= signal == TIME and unit is not None
+        if request.written and stated and is_unit(stated) and not _are_equal(request.written, stated):
+            fault = f"the table says {shown(stated)}, the machine file unit = {shown(request.written)}"
+            remedy = f"remove unit from the {'time of the ' if signal == TIME else ''}signal, or correct the table"
+            raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {fault}: {remedy}")
         try:
             columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
         except ValueError as error:
             raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {error}") from error
     return columns, is_stated
+
+
+def _are_equal(one: str, other: str) -> bool:
+    """Whether two units are the same, however they are written."""
+    try:
+        return factor(one, other) == (1.0, 0.0)
+    except ValueError:
+        return False
 
 
 def columns_called(name: str, line: str) -> int:
@@ -222,10 +235,13 @@ def _question(header: Header, cells: list[str], rows: list[list[str]]) -> str:
     for name, index, _ in header.others:
         if question := contradiction(cells[clock], times, name, [row[index] for row in rows]):
             return question
-        is_beside = index > clock and index + 1 in signals and BESIDE_NAME.fullmatch(name)
-        if is_beside and rises_evenly(_numbers_in(rows, index)):
-            either = f'time = "{name}" for {signals[index + 1]}, or time = "{cells[clock]}" if it has not'
-            return f"column {shown(name)} may have the times of the column behind it: write {either}"
+        own, side = signals.get(index + 1), "behind"
+        if clock - 1 in signals and index - 1 in signals:  # value, time, value, time
+            own, side = signals[index - 1], "before"
+        is_time = own is not None and index > clock and BESIDE_NAME.fullmatch(name)
+        if is_time and rises_evenly(_numbers_in(rows, index)):
+            either = f'time = "{name}" for {own}, or time = "{cells[clock]}" if it has not'
+            return f"column {shown(name)} may have the times of the column {side} it: write {either}"
     return ""
 
 
@@ -261,7 +277,8 @@ def _places(
             others += [(name, index, written)] if name else []
             times += [(name, (index, written or (match[1] and match[1].lower())))] if match else []
     if clocks:
-        places[time] = _clock(place, clocks, wanted, places)
+        named = [index for index, cell in enumerate(cells) if cell]
+        places[time] = _clock(place, clocks, wanted, places, (named[0], named[-1]))
     elif time == TIME and times:
         name, places[TIME] = _only(place, times, cells)
         others = [other for other in others if other[0] != name]
@@ -279,16 +296,35 @@ def _only(place: str, times: list[tuple[str, Place]], cells: list[str]) -> tuple
     return times[0]
 
 
-def _clock(place: str, clocks: list[Place], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> Place:
-    """The one of several columns with the name of the time that stands before the wanted columns."""
-    at = [places[request.column][0] for request in wanted.values() if request.column in places]
-    before = {max((clock for clock in clocks if clock[0] < index), default=clocks[0]) for index in at} or set(clocks)
-    if len(before) > 1 or (len(clocks) > 1 and wanted[TIME].column == TIME):
-        name = wanted[TIME].column
+def _clock(
+    place: str,
+    clocks: list[Place],
+    wanted: Mapping[str, ColumnRequest],
+    places: Mapping[str, Place],
+    ends: tuple[int, int],
+) -> Place:
+    """The one of several columns with the name of the time that belongs to the wanted columns.
+
+    It stands before them or, in a table whose last column is a time and whose first one is none, behind them; ``ends``
+    are the positions of these two columns.
+    """
+    if len(clocks) == 1:
+        return clocks[0]
+    name, at = wanted[TIME].column, [places[row.column][0] for row in wanted.values() if row.column in places]
+    is_first, is_last = ends[0] == clocks[0][0], ends[1] == clocks[-1][0]
+    if is_first and is_last and at and name != TIME:
+        both = f"the first and the last column are called {name}, so that each may belong to the column on either side"
+        raise ConfigurationError(f"{place}: {both}: give them names of their own")
+    if is_last and not is_first:
+        own = [min((clock for clock in clocks if clock[0] > index), default=None) for index in at]
+    else:
+        own = [max((clock for clock in clocks if clock[0] < index), default=None) for index in at]
+    found = {clock for clock in own if clock is not None} if at else set(clocks)
+    if len(found) != 1 or None in own or name == TIME:
         raise ConfigurationError(
             f"{place}: {len(clocks)} columns are called {name}: remove all but one, or {BESIDE_IT}"
         )
-    return before.pop()
+    return found.pop()
 
 
 def is_number(cell: str) -> bool:

@@ -15,7 +15,7 @@ from otolith_drivers.replay.tables import TableSource, open_log
 from tests.messages import raises_saying
 
 BEGIN = 1_714_993_372.0  # 2024-05-06 11:02:52 UTC
-NAMED = {"time": "Name"}
+NAMED: dict[str, object] = {"time": "Name"}
 
 
 def samples(path: Path, **sources: dict[str, object]) -> dict[str, list[tuple[float, float]]]:
@@ -58,6 +58,39 @@ def test_each_signal_has_the_times_of_the_column_before_it(tmp_path: Path) -> No
     assert (len(found["fast"]), len(found["slow"])) == (100, 20)
     for readings in found.values():
         assert [time for time, _ in readings] == pytest.approx([value / 1e3 for _, value in readings])
+
+
+def test_times_behind_their_values_are_found(tmp_path: Path) -> None:
+    rows = [f"{row},{row / 10},{row},{row / 5}" for row in range(10)]
+    path = table(tmp_path, "x,Name,y,Name", rows)
+    found = samples(path, x=NAMED, y=NAMED)
+    assert_readings(found["x"][9:], [0.9], [9.0])
+    assert_readings(found["y"][9:], [1.8], [9.0])
+    with raises_saying(ConfigurationError, "table.csv:1", "Time", "y", 'time = "'):
+        samples(table(tmp_path, "x,t,y,Time", rows), x={}, y={})
+
+
+def test_times_on_either_side_of_values_are_refused(tmp_path: Path) -> None:
+    path = table(tmp_path, "Name,x,Name,y,Name", [f"{row},{row},{row},{row},{row}" for row in range(10)])
+    with raises_saying(ConfigurationError, "table.csv:1", "Name"):
+        samples(path, x=NAMED, y=NAMED)
+
+
+@pytest.mark.parametrize("header", ["t [ms],x [A]", "t,x\nms,A"], ids=["in the header", "below it"])
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [({"time": {"column": "t", "unit": "s"}}, ("ms", "s")), ({"unit": "mA"}, ("A", "mA"))],
+    ids=["time", "signal"],
+)
+def test_a_unit_that_the_table_contradicts_is_refused(
+    header: str, source: dict[str, object], words: tuple[str, str], tmp_path: Path
+) -> None:
+    path, other = table(tmp_path, header, [f"{row},{row}" for row in range(10)]), TableSource.model_validate(source)
+    with raises_saying(ConfigurationError, "table.csv", *(f"'{word}'" for word in words), "unit"):
+        open_log(path, Setup((Signal(name="x", unit="A", source=other),), tmp_path, 0.01))
+    same = TableSource.model_validate({"unit": "ampere", "time": {"column": "t", "unit": "msec"}})
+    with open_log(path, Setup((Signal(name="x", unit="A", source=same),), tmp_path, 0.01)) as reader:
+        assert next(iter(reader.chunks())).times[1] == pytest.approx(1e-3)
 
 
 def test_columns_with_one_name_are_asked_about(tmp_path: Path) -> None:

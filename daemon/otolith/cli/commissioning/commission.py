@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,15 @@ MORE_MOTION = "record more changes of speed and load, or set the baseline later 
 Decide = Callable[[], bool | None]  # Whether a component belongs to the healthy machine; None: it is left open
 
 
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """How a machine is commissioned."""
+
+    decide: Decide  # Asked of each component that was found
+    write: bool = False  # Write into the machine file, rather than print
+    details: bool = False  # Print each finding
+
+
 @click.command()
 @MACHINE_FILE
 @click.argument("data", type=FILE, required=False)
@@ -50,6 +59,7 @@ Decide = Callable[[], bool | None]  # Whether a component belongs to the healthy
 @click.option("--yes", is_flag=True, help="Approve every component that is found.")
 @click.option("--write", is_flag=True, help="Write noise, delays and values that FILE does not state into FILE.")
 @click.option("--windows", type=click.IntRange(1, 1000), default=WINDOWS, help="At most so many windows for the noise.")
+@click.option("--details", is_flag=True, help="Print each finding of the replay, not their number.")
 def commission(
     file: Path,
     data: Path | None,
@@ -59,6 +69,7 @@ def commission(
     yes: bool,
     write: bool,
     windows: int,
+    details: bool,
 ) -> None:
     """Identify what is normal for the machine in FILE.
 
@@ -86,7 +97,8 @@ def commission(
     if last and since:
         raise click.UsageError("--last and --since both say where it begins: give one of them")
     if data is not None:
-        commission_log(file, data, windows, decide=(lambda: True) if yes else ask_if_healthy, write=write)
+        how = Manner((lambda: True) if yes else ask_if_healthy, write=write, details=details)
+        commission_log(file, data, windows, how)
         return
     machine, store = loaded(file)
     zone = machine.plan.timezone
@@ -94,25 +106,21 @@ def commission(
     begin = (last or since or Since()).before(end if last else time.time(), zone)
     if begin >= end:
         raise click.UsageError(f"it begins at {local_time(begin, zone)}, but ends at {local_time(end, zone)}")
-    _commission_running(
-        machine, store, (begin, end), windows, decide=(lambda: True) if yes else ask_if_healthy, write=write
-    )
+    how = Manner((lambda: True) if yes else ask_if_healthy, write=write, details=details)
+    _commission_running(machine, store, (begin, end), windows, how)
 
 
-def commission_log(file: Path, data: Path, windows: int, *, decide: Decide, write: bool) -> None:
-    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``.
-
-    ``decide`` is asked of each component that was found.
-    """
+def commission_log(file: Path, data: Path, windows: int, how: Manner) -> None:
+    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``."""
     from otolith.cli.commissioning.noise import HealthyLog
 
     machine, store = loaded(file)
     with store.locked():
-        if write:
+        if how.write:
             machine = _with_own_values(machine, HealthyLog(data), windows)
         elif names := [row.name for row in machine.twin.parameters if row.part and row.name not in _stated(machine)]:
             echo(f"{machine.path}: {', '.join(names)}: values of the twin's example; --write determines them", err=True)
-        _commission(machine, store, HealthyLog(data), windows, decide=decide, write=write)
+        _commission(machine, store, HealthyLog(data), windows, how)
 
 
 def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int) -> "LoadedMachine":
@@ -281,9 +289,7 @@ def _commission(
     store: "StateStore",
     data: "HealthyData",
     windows: int,
-    *,
-    decide: Decide,
-    write: bool,
+    how: Manner,
 ) -> None:
     from otolith.adaptation.state import ComponentRecord
     from otolith.cli.commissioning.noise import delay_lines, identified_record, noise_lines
@@ -293,24 +299,25 @@ def _commission(
     record = identified_record(machine, data, windows)
     identified = record.noise_beside(machine) if record.offered else record.noise
     components = tuple(ComponentRecord.of(item) for item in record.offered)
-    if write:
+    if how.write:
         machine = _with_noise_and_delays(machine, identified, record.delays)
-        state, advice = _replayed(machine, data, components)
+        state, advice = _replayed(machine, data, how, components)
     else:
         is_useless = bool(components) or explains_no_window(machine.problem, record.noise, record.windows[0])
-        first = None if is_useless else _replayed(machine, data)
+        first = None if is_useless else _replayed(machine, data, how)
         echo(*noise_lines(machine, identified), *delay_lines(machine, record.delays))
         if first is not None and first[0].adopted:  # the file's noise levels may have hidden a component
             state, advice = first
         else:
-            state, advice = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
+            levels = replace(machine, problem=identified.applied(machine.problem))
+            state, advice = _replayed(levels, data, how, components)
         if record.offered:
             echo("# this process noise is right with the components below: if you approve them, put it into the file")
         elif state.adopted:
             echo("# this process noise contains the components below: keep that of the file if you approve them")
         else:
             echo("# put these tables into the machine file in place of its own, or let --write do it", err=True)
-    _review(machine, store, state, components, decide=decide)
+    _review(machine, store, state, components, decide=how.decide)
     try:
         keep_baseline(machine, store, state.health.histories, advice)
     except OtolithError as error:  # nothing that has limits, or a record that is too short
@@ -318,27 +325,34 @@ def _commission(
 
 
 def _replayed(
-    machine: "LoadedMachine", data: "HealthyData", components: "tuple[ComponentRecord, ...]" = ()
+    machine: "LoadedMachine", data: "HealthyData", how: Manner, components: "tuple[ComponentRecord, ...]" = ()
 ) -> "tuple[AdaptationState, dict[str, str]]":
     """Return the state after all windows of the data, and for each parameter what would determine it.
 
     The ``components`` are in the twin from the first window on.
 
-    Findings and warnings are printed to standard error.
+    The number of findings and warnings are printed to standard error, with details each finding.
     """
     from otolith.adaptation.state import restore_components
     from otolith.runtime.replay import Replay
+    from otolith_drivers.errors import counted
 
     advice: dict[str, str] = {}
+    findings, with_findings, windows = 0, 0, 0
     with data.opened(machine) as recorded, progress_line("replay") as show:
         run = Replay(machine, recorded)
         run.state = restore_components(run.state, components)
         for report in run.reports():
             document = report.document
             show(f"window {document.window.index}, {run.progress:.0%} of the data")
-            for finding in document.findings:
+            findings, windows = findings + len(document.findings), windows + 1
+            with_findings += bool(document.findings)
+            for finding in document.findings if how.details else ():
                 echo(f"window {document.window.index}: {finding.text}", err=True)
             advice |= {name: item.advice for name, item in document.parameters.items() if item.advice}
+        if findings and not how.details:
+            of = f"in {counted(with_findings, 'window')} of {windows}"
+            echo(f"{counted(findings, 'finding')} {of} of the replay: --details prints them", err=True)
         echo_warnings(data.path, run.warnings())
         return run.state, advice
 
@@ -417,9 +431,7 @@ def _commission_running(
     store: "StateStore",
     span: tuple[float, float],
     windows: int,
-    *,
-    decide: Decide,
-    write: bool,
+    how: Manner,
 ) -> None:
     """Commission by what a daemon has recorded and estimated from the first time of ``span`` to the second."""
     from otolith.cli.commissioning.noise import HealthySpan, UnusableData, delay_lines, identified_record, noise_lines
@@ -432,14 +444,14 @@ def _commission_running(
     _warn_of_events(reader, span, zone)
     before = machine
     try:
-        if write:
+        if how.write:
             machine = _with_own_values(machine, data, windows)
         record = identified_record(machine, data, windows)
     except UnusableData as error:  # it records nothing, or not for so long
         what = "values, noise and delays" if machine is before else "the new values are in the file; noise and delays"
         echo(f"{what} are as they were: {error}", err=True)
     else:
-        if write:
+        if how.write:
             machine = _with_noise_and_delays(machine, record.noise, record.delays)
         else:
             echo(*noise_lines(machine, record.noise), *delay_lines(machine, record.delays))
@@ -447,13 +459,13 @@ def _commission_running(
         echo("a running daemon takes these lines over when it is started again", err=True)
     known = store.decisions()
     records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
-    approved, rejected = asked(machine, records, decide=decide)
+    approved, rejected = asked(machine, records, decide=how.decide)
     if records:
         _decide(store, approved, rejected)
     if machine.file.parameters == before.file.parameters:
         histories, advice = _estimated(machine, reader, span)
     else:  # what was estimated with other values does not count
-        state, advice = _replayed(machine, data)
+        state, advice = _replayed(machine, data, how)
         histories = dict(state.health.histories)
     keep_baseline(machine, store, histories, advice, labels=reader.labels())
     echo("a running daemon takes the baseline over with its next window", err=True)

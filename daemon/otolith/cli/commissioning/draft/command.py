@@ -139,7 +139,7 @@ def _finish(
 ) -> None:
     """Write the file, commission the machine by its log if that is wanted, and name the next command."""
     from otolith.cli.commissioning.check import lines_without_limits
-    from otolith.cli.commissioning.commission import WINDOWS, ask_if_healthy, commission_log
+    from otolith.cli.commissioning.commission import WINDOWS, Manner, ask_if_healthy, commission_log
     from otolith.cli.commissioning.draft.choosing import next_lines, write_draft
     from otolith.machine import load_machine
 
@@ -150,7 +150,7 @@ def _finish(
         decide = (
             ask_if_healthy if questions.asks else lambda: None
         )  # what nobody was asked is no part of a healthy machine
-        commission_log(file, Path(source.check), WINDOWS, decide=decide, write=True)
+        commission_log(file, Path(source.check), WINDOWS, Manner(decide, write=True))
     else:
         echo(*lines_without_limits(load_machine(file, with_driver=False)))
     echo(*next_lines(file, source, is_commissioned=commissions))

@@ -1,9 +1,11 @@
 """Which register is which signal, and what a step of it is worth, from what the display of a drive shows meanwhile.
 
 Registers have neither names nor units. Drives scale them by powers of ten, so that a number off the display, times one
-of these, is what the register holds.
+of these, is what the register holds. Some hold another usual unit than the display shows, as rad/s where that has rpm:
+these are tried for a value that no register holds in its own unit, or not as closely: 0.1 rad/s is nearly 1 rpm.
 """
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from otolith.acquisition.window import Array
 from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.offers import Offer
 from otolith.cli.terminal import echo
@@ -22,6 +25,16 @@ from otolith_drivers.units import factor
 POWERS = range(-5, 4)  # of ten, by which a drive scales a register
 CLOSE = 0.05  # of the displayed value: how far a register may be from it
 AS_CLOSE = 0.01  # of the displayed value: registers that differ by less are both named
+USUAL = (  # units of one quantity between which displays and registers differ by no power of ten
+    ("rpm", "rad/s", "turn/s"),
+    ("degree", "rad", "turn"),
+    ("kW", "hp"),
+    ("bar", "psi"),
+    ("m/s", "km/h", "m/min"),
+    ("m^3/h", "l/min", "l/s"),
+    ("N*m", "lbf*ft"),
+    ("N", "lbf"),
+)
 UNLIKELY = 1e6  # distance of what cannot be the same
 
 
@@ -36,9 +49,15 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
     twin = _twin_of(answers, twins)
     shown = {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
     names = [name for name in shown if name not in answers.signals]
-    distances = np.array([[_distance(shown[name][0], offer) for offer in offers] for name in names])
+    distances, pairs = _assigned([shown[name][0] for name in names], offers)
+    found = {names[at] for at, place in pairs if distances[at, place] <= CLOSE}
+    taken = {place for at, place in pairs if names[at] in found}
+    rest = [offer for at, offer in enumerate(offers) if at not in taken]
+    shown |= {name: _in_usual_unit(shown[name], rest) for name in names if name not in found}
+    close = {names[at]: offers[place] for at, place in pairs if names[at] in found}
+    shown |= {name: _in_usual_unit(shown[name], [offer]) for name, offer in close.items()}
     signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
-    pairs = list(zip(*linear_sum_assignment(distances.reshape(len(names), len(offers))), strict=True))
+    distances, pairs = _assigned([shown[name][0] for name in names], offers)
     found = {names[at] for at, place in pairs if distances[at, place] <= CLOSE}
     if lost := [f"{name}={answers.displays[name]}" for name in names if name not in found]:
         raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(offers)}")
@@ -54,6 +73,37 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
             remedy = f"another speed or load decides, or --signal {name}=REGISTER"
             echo(f"! {', '.join(others)} would fit {name} as well: {remedy}")
     return replace(answers, twin=twin.name, signals=signals, units=units, scales=scales)
+
+
+def _assigned(values: Sequence[float], offers: Sequence[Offer]) -> tuple[Array, list[tuple[int, int]]]:
+    """Return the distance of each value from each register, and which register is best for which value."""
+    distances = np.array([[_distance(value, offer) for offer in offers] for value in values])
+    distances = distances.reshape(len(values), len(offers))
+    return distances, list(zip(*map(np.ndarray.tolist, linear_sum_assignment(distances)), strict=True))
+
+
+def _in_usual_unit(shown: tuple[float, str], offers: Sequence[Offer]) -> tuple[float, str]:
+    """Return a displayed value in the usual unit in which a register holds it; else as it is."""
+
+    def distance(number: float) -> float:
+        return min((_distance(number, offer) for offer in offers), default=UNLIKELY)
+
+    value, unit = shown
+    converted = [shown]
+    for other in (other for units in USUAL for other in units if _is_one_of(unit, units)):
+        scale, offset = factor(unit, other)
+        converted.append((scale * value + offset, other))
+    closest = min(converted, key=lambda each: distance(each[0]))
+    return closest if distance(closest[0]) <= min(CLOSE, distance(value) - AS_CLOSE) else shown
+
+
+def _is_one_of(unit: str, units: Sequence[str]) -> bool:
+    """Whether a unit is one of the ``units``, however it is written."""
+    for other in units:
+        with contextlib.suppress(ValueError):
+            if factor(unit, other) == (1.0, 0.0):
+                return True
+    return False
 
 
 def _not_found(offers: Sequence[Offer]) -> str:
