@@ -24,7 +24,7 @@ from otolith.discovery.screening import (
     inner_grid,
     screen_window,
 )
-from otolith.estimation.evidence import DECISIVE, EXPLAINED
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate_window
@@ -164,11 +164,12 @@ def test_a_force_that_appears_at_1_khz_is_an_offset() -> None:
     assert report.document.cost.searched
     assert state.test is not None
     causes = {
-        (item.type, item.hypothesis.name): (item.cost, share)
+        (item.type, item.hypothesis.name): (item.is_explained, share)
         for item, share in zip(state.test.hypotheses, state.test.probabilities, strict=True)
     }
-    cost, share = causes[FaultType.PARAMETER, "offset"]
-    assert max(cost, causes[FaultType.SENSOR, "sensor of F/constant"][0]) < EXPLAINED
+    is_explained, share = causes[FaultType.PARAMETER, "offset"]
+    assert is_explained
+    assert causes[FaultType.SENSOR, "sensor of F/constant"][0]
     assert share == pytest.approx(causes[FaultType.SENSOR, "sensor of F/constant"][1], rel=0.05)
 
 

@@ -7,9 +7,11 @@ from scipy.special import chdtrc, chdtri
 from otolith.acquisition.window import Array
 from otolith.estimation.evidence import (
     CHANCE,
+    LEVEL_ERROR,
     LogEvidence,
     chi_square_limit,
     discount,
+    is_explained,
     likelihood_ratios,
     log_determinant,
     penalty,
@@ -75,3 +77,18 @@ def test_the_limit_of_chi_square_is_exact_for_few_degrees_of_freedom(degrees: in
 @pytest.mark.parametrize("degrees", [101, 400, 10_000, 1_000_000])
 def test_the_limit_of_chi_square_is_close_for_many(degrees: int) -> None:
     assert 0.8 * CHANCE < float(chdtrc(degrees, chi_square_limit(degrees))) <= CHANCE
+
+
+@pytest.mark.parametrize("count", [10, 20, 100, 400, 10_000, 1_000_000])
+def test_noise_whose_level_is_known_is_explained_in_windows_of_any_length(count: int) -> None:
+    """One window in 10⁹ exceeds it; an RMSE of 1.5 is exceeded by one window of ten values in eighty."""
+    limit = float(chdtri(count, CHANCE))
+    assert is_explained(limit, count)
+    assert is_explained(LEVEL_ERROR**2 * 0.99 * limit, count)
+    assert not is_explained(LEVEL_ERROR**2 * 1.01 * limit, count)
+
+
+def test_a_long_window_is_explained_only_up_to_the_uncertainty_of_the_level() -> None:
+    """An RMSE of 1.5 is 88 standard deviations of χ² of 10 000 values: no noise."""
+    assert is_explained(1.5**2 * 400, 400)
+    assert not is_explained(1.5**2 * 10_000, 10_000)

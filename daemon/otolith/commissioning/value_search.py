@@ -9,7 +9,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
-from otolith.estimation.evidence import DECISIVE, EXPLAINED
+from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
@@ -22,6 +22,7 @@ from otolith_drivers.units import to_base
 STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would be a random walk
 STAGE_STEPS, LAST_STEPS = 12, 40  # of Gauss-Newton
 QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
+MAX_QUIET_COST = 1.5  # RMSE of that fit over the noise, up to which the twin hardly lacks anything
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
 MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
 PHASES = 8  # of a sine that are tried in each window
@@ -61,7 +62,7 @@ class OwnValues:
     @property
     def is_explained(self) -> bool:
         """Whether the twin leaves no more than noise where it is hardly corrected."""
-        return self.is_followed and self.quiet_cost <= EXPLAINED
+        return self.is_followed and self.quiet_cost <= MAX_QUIET_COST
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,11 +25,11 @@ from otolith.acquisition.window import Array
 
 # Thresholds: docs/reference/thresholds-estimation.md has the origin of each.
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
-EXPLAINED = 1.5  # RMSE in units of the noise up to which a residual counts as noise
+LEVEL_ERROR = 1.25  # factor by which the noise may be larger than stated
 CHANCE = 1e-9  # probability of what noise alone does not do
 EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
 ROUNDING = 1e-12  # share of a limit up to which it is computed
-STRUCTURE = 1.5  # the same with the correlation of what is left: above it, there is more than noise
+STRUCTURE = 1.5  # RMSE over the noise, with the correlation of what is left, above which that is more than noise
 NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 
 
@@ -96,8 +96,8 @@ def _upper_tail(chi_square: float, degrees: int) -> float:
 
 
 def is_explained(chi_square: float, count: float) -> bool:
-    """Whether ``chi_square`` of ``count`` measured values is what noise leaves."""
-    return chi_square <= EXPLAINED**2 * count
+    """Whether ``chi_square`` of ``count`` measured values is what noise leaves, whose level may be misstated."""
+    return chi_square <= LEVEL_ERROR**2 * chi_square_limit(int(count))
 
 
 def log_determinant(covariance: Array) -> Array:
