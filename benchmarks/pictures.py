@@ -104,7 +104,8 @@ def reduced(picture: bytes, size: tuple[int, int] = SIZE) -> bytes:
     output = BytesIO()
     whole = Image.open(BytesIO(picture)).convert("RGB")
     image = whole if whole.size == size else whole.resize(size, Image.Resampling.LANCZOS)
-    image.quantize(COLOURS, dither=Image.Dither.NONE).save(output, "PNG", optimize=True)
+    method = Image.Quantize.MAXCOVERAGE  # the median cut makes the thin lines of two limits one colour
+    image.quantize(COLOURS, method, dither=Image.Dither.NONE).save(output, "PNG", optimize=True)
     return output.getvalue()
 
 
