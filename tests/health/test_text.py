@@ -82,6 +82,15 @@ def test_summary_is_one_line_with_reasons_and_warnings() -> None:
     )
 
 
+def test_a_line_does_not_repeat_what_the_line_before_has_said() -> None:
+    driver = DriverDocument(up=True, warnings=("slow",))
+    update = {"parameters": {"R_a": ESTIMATED, "L_a": UNKNOWN}, "findings": (LEAK,), "driver": driver}
+    first, second = (report(index).model_copy(update=update) for index in (3, 4))
+    assert summary(second, first) == "window 4 good, R_a 5.9856 ± 0.0075 Ω, L_a unknown, 2 as before"
+    other = second.model_copy(update={"driver": DriverDocument(up=True, warnings=("late",))})
+    assert summary(other, first).endswith("late, 1 as before")
+
+
 EVENT = EventDocument(
     id="limit/R_a@54.0",
     part="winding",

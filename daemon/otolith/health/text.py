@@ -340,16 +340,32 @@ def brief(document: ReportDocument, when: Clock | None = None) -> str:
     return line
 
 
-def summary(document: ReportDocument) -> str:
-    """A report in one line: state, window, parameters, findings, and the first warning of the driver."""
+def summary(document: ReportDocument, before: ReportDocument | None = None) -> str:
+    """A report in one line: state, window, parameters, findings, and the first warning of the driver.
+
+    What the line of the report ``before`` it has said is counted.
+    """
     parts: list[str] = [] if document.health is None else [document.health.state]
     parts += [f"window {document.window.index} {document.window.quality.verdict}"]
+    said = {} if before is None else _notices(before)
     for name, parameter in document.parameters.items():
-        parts += [parameter_text(name, parameter), forecast_text(parameter, document.window.end)]
-    parts += [finding_text(finding) for finding in document.findings]
-    if (driver := document.driver) is not None:
-        parts += [] if driver.up else [f"no connection: {driver.reason}"]
-        parts += driver.warnings[:1]
-        more = len(driver.warnings) - 1
-        parts += [f"and {more} more warnings"] if more > 0 else []
+        known = None if before is None else before.parameters.get(name)
+        is_known = known is not None and (known.status, known.reason) == (parameter.status, parameter.reason)
+        text = f"{name} {value_text(parameter)}" if is_known else parameter_text(name, parameter)
+        parts += [text, forecast_text(parameter, document.window.end)]
+    notices = _notices(document)
+    new = [text for key, text in notices.items() if key not in said]
+    same = len(notices) - len(new)
+    parts += [*new, f"{same} as before" if same else ""]
+    more = len(document.driver.warnings) - 1 if document.driver is not None else 0
+    parts += [f"and {more} more warnings"] if more > 0 and new else []
     return ", ".join(filter(None, parts))
+
+
+def _notices(document: ReportDocument) -> dict[str, str]:
+    """Return findings, a missing connection and the first warning of the driver, by what each is about."""
+    notices = {f"{row.id or row.text} {row.severity}": finding_text(row) for row in document.findings}
+    if (driver := document.driver) is not None:
+        notices |= {} if driver.up else {f"connection {driver.reason}": f"no connection: {driver.reason}"}
+        notices |= {f"warning {text}": text for text in driver.warnings[:1]}
+    return notices

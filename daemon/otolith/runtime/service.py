@@ -213,6 +213,7 @@ class Service:
         self._started_at = self._fed_at = 0.0
         self._stall = Effort()  # of the worker since its last progress
         self._summarised_at = -math.inf
+        self._logged: ReportDocument | None = None  # The last report with a line in the log
 
     def run(self) -> int:
         """Serve until SIGTERM or SIGINT, or in a terminal SIGHUP, and return the number of that signal.
@@ -493,11 +494,12 @@ class Service:
             if not event.is_silent:
                 self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
+        short, self._logged = summary(document, self._logged), document
         self._summarised_at = now if is_due else self._summarised_at
         if is_due and self._publisher is not None:
             self._warn_of_expiry(self._publisher, datetime.now(UTC))
         self._notifier.send(f"STATUS={line}")
-        log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line)
+        log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line if is_due else short)
 
     def _warn_of_expiry(self, publisher: Publisher, now: datetime) -> None:
         """Log that the certificate of an endpoint expires soon, and note it in the next report."""
