@@ -32,6 +32,7 @@ from otolith.discovery.hypotheses import (
     without_insignificant,
 )
 from otolith.discovery.noise_hypothesis import is_white, normalisation
+from otolith.discovery.same_statement import without_repetitions
 from otolith.discovery.screening import ScreeningResult
 from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
 from otolith.estimation.evidence import DECISIVE, NO_EVIDENCE, LogEvidence, discount, likelihood_ratios
@@ -254,9 +255,10 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         deviance = min(evidence[item].deviance - least, MAX_FIRST_EVIDENCE)
         misfit = min(evidence[item].misfit - least_misfit, MAX_FIRST_EVIDENCE)
         tracked.append(track(item, predicted, deviance, misfit))
+    usable = [item for item in tracked if item is not None]
     return SequentialTest(
         predicted.problem,
-        _sorted([item for item in tracked if item is not None]),
+        _sorted(without_repetitions(usable, predicted.problem)),
         best.fit.window.start,
         last=evidence[best],
         null_reduced_chi_square=discount(null.chi_square, count),
@@ -277,6 +279,7 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
         return test
     if test.counts.tested >= PRUNED_AFTER:
         tracked = prune(tracked, deviances)
+    tracked = without_repetitions(tracked, test.problem)
     evidence = test.filter_evidence.worse_by(-min(item.deviance for item in tracked))
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.counts.tested > MAX_OPEN_WINDOWS:
@@ -369,6 +372,7 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
         return test
     lead = min(gain, MAX_WINDOW_EVIDENCE)
     together = _best_of_each([*(item.worse_by(lead, lead) for item in test.hypotheses), *fresh.hypotheses])
+    together = without_repetitions(together, test.problem)
     hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
     evidence = test.filter_evidence.worse_by(lead).worse_by(-min(item.deviance for item in together))
     joined = replace(test, hypotheses=hypotheses, filter_evidence=evidence)

@@ -15,13 +15,13 @@ from otolith_drivers.units import to_base
 
 @lru_cache(maxsize=64)
 def ordered_equations(base: Definition) -> tuple[list[tuple[str, ast.expr]], dict[str, float]]:
-    """Return definitions and rates as trees, each after those that it uses, and the scale of every quantity."""
+    """Return definitions, then rates and outputs, as trees, each after those that it uses, and all scales of units."""
     pending = {name: parse(text) for name, text, _ in base.definitions}
     ordered: list[tuple[str, ast.expr]] = []
     while pending:
         ready = [name for name, tree in pending.items() if not names_in(tree) & (pending.keys() - {name})]
         ordered += [(name, pending.pop(name)) for name in ready]
-    ordered += [(left, parse(text)) for left, text in base.equations if left.startswith("der(")]
+    ordered += [(left, parse(text)) for left, text in base.equations]
     return ordered, {name: to_base(unit)[0] for name, unit in base.units().items()}
 
 
@@ -38,8 +38,26 @@ def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, en
     ``columns`` has every input, state and parameter, (records,) or one value, in its own unit; ``entering`` is added at
     ``site``.
     """
+    values, scales = _evaluated(base, columns, site, np.array([entering]))
+    return [_rows(values[f"der({state.name})"], scales[state.name]) for state in base.states]
+
+
+def right_sides(base: Definition, columns: Mapping[str, Array], site: int, entering: Array) -> Array:
+    """Return the right sides of all equations (equations, records), as ``rate_terms``; ``entering`` is (records,)."""
+    values, scales = _evaluated(base, columns, site, entering)
+    names = [left.removeprefix("der(").removesuffix(")") for left, _ in base.equations]
+    rows = [
+        _rows(values[left], scales[name]).sum(axis=0) for (left, _), name in zip(base.equations, names, strict=True)
+    ]
+    return np.array(np.broadcast_arrays(*rows))
+
+
+def _evaluated(
+    base: Definition, columns: Mapping[str, Array], site: int, entering: Array
+) -> tuple[dict[str, list[Array]], dict[str, float]]:
+    """Return the terms of every quantity and right side, in base units, and the scales of the units."""
     ordered, scales = ordered_equations(base)
-    entered = base.sites[site] if entering else None
+    entered = base.sites[site] if entering.any() else None
     values = {name: [np.asarray(column) * scales[name]] for name, column in columns.items()}
     values |= {fixed.name: [np.array([fixed.value * scales[fixed.name]])] for fixed in base.constants}
     with np.errstate(all="ignore"):
@@ -52,7 +70,7 @@ def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, en
             else:
                 through, scale = _entrance(base, site)
                 values[name] = [*values[name], evaluate(through, values) * entering * scale]
-    return [_rows(values[f"der({state.name})"], scales[state.name]) for state in base.states]
+    return values, scales
 
 
 def _rows(summands: list[Array], scale: float) -> Array:
