@@ -50,7 +50,8 @@ def found(twin: Definition, windows: list[Window], loads: set[str]) -> OwnValues
     free = tuple(row for row in twin.parameters if row.role is Role.ESTIMATED)
     known = tuple((row.name, row.nominal) for row in twin.parameters if row.role is not Role.ESTIMATED)
     problem = Problem(twin, known, free, tuple(output.noise for output in twin.outputs))
-    return own_values(problem, windows, twin.parameters, loads, lambda _: None)
+    searched = [row for row in twin.parameters if row.part or row.role is Role.ESTIMATED]  # as commissioning does
+    return own_values(problem, windows, searched, loads, lambda _: None)
 
 
 def by_name(values: OwnValues) -> dict[str, OwnValue]:
@@ -81,6 +82,21 @@ def test_without_the_load_the_torque_constant_is_that_of_the_voltage(motor: Moto
     assert (rows["K_t"].value, rows["K_t"].sd) == (rows["K_e"].value, rows["K_e"].sd)
     assert "T_load" not in rows
     assert max(map(abs, values.loads["T_load"])) < 1e-3
+
+
+@pytest.mark.parametrize("load", [0.0, 6e-3])
+def test_a_load_without_dry_friction_is_found_to_have_none(motor: MotorScenario, windows: Cut, load: float) -> None:
+    """Zero is as well determined as any value: the example's dry friction, held, would bias the viscous one."""
+    loaded = motor.model_copy(update={"load": load})
+    twin = without_sensor(find_twin("dc_motor"), UnmeasuredInput("T_load", Assumption.FRICTION))
+    values = found(twin, [window for window, _ in windows(loaded, 8)], set())
+    rows = by_name(values)
+    assert values.is_followed
+    assert not values.faults
+    for name, truth in (("T_load_dry", 0.0), ("D", TRUE["D"] + load)):
+        sd = rows[name].sd
+        assert sd is not None
+        assert abs(rows[name].value - truth) < 4.0 * sd, name
 
 
 def test_what_the_data_do_not_show_stays_as_it_was(motor: MotorScenario, windows: Cut) -> None:

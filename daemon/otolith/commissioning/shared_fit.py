@@ -113,19 +113,20 @@ class SharedFit:
 
 
 def deviations(
-    result: FitResult, together: SharedFit, values: Mapping[str, float], cost: float
+    result: FitResult, together: SharedFit, sizes: Mapping[str, float], cost: float
 ) -> tuple[dict[str, float], list[str] | None]:
     """Return the deviation of each shared parameter; and those of the weakest direction, if one is not determined.
 
-    The residuals are inflated by ``cost``. The one that the direction moves most comes first.
+    ``sizes`` are those of the shared parameters, with which intervals are compared. The residuals are inflated by
+    ``cost``. The one that the direction moves most comes first.
     """
     count = len(together.scales)
     slopes = np.array(
         [scale.slope(float(number)) for scale, number in zip(together.scales, result.guess, strict=False)]
     )
-    sizes = np.array([size_of(scale, value) for scale, value in zip(together.scales, values.values(), strict=True)])
+    lengths = np.array(list(sizes.values()))
     # Per share of a value, so that directions can be compared.
-    jacobian = result.jacobian[:, :count] / slopes * sizes / max(cost, 1.0)
+    jacobian = result.jacobian[:, :count] / slopes * lengths / max(cost, 1.0)
     own = result.jacobian[:, count:]
     scale = np.maximum(np.linalg.norm(own, axis=0), np.finfo(float).tiny)
     left = _projected(own / scale, jacobian)
@@ -133,11 +134,11 @@ def deviations(
     eigenvalues, directions = np.linalg.eigh(normal)
     variances = 1.0 / np.maximum(eigenvalues, 1e-12 * max(float(eigenvalues.max()), 1e-300))
     share = np.sqrt((directions**2) @ variances)
-    sd = {name: float(own_share * size) for name, own_share, size in zip(values, share, sizes, strict=True)}
+    sd = {name: float(own_share * size) for (name, size), own_share in zip(sizes.items(), share, strict=True)}
     if QUANTILE * share.max() <= DETERMINED:
         return sd, None
     weights = np.abs(directions[:, 0])
-    names = list(values)
+    names = list(sizes)
     order = np.argsort(-weights, kind="stable")
     return sd, [names[at] for at in order if weights[at] > 0.1 * weights.max()]
 
@@ -149,6 +150,6 @@ def _projected(own: Array, columns: Array) -> Array:
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
-def size_of(scale: SharedScale, value: float) -> float:
-    """Return what an interval is compared with: the value; if it may be zero, also the example's."""
-    return abs(value) if scale.is_log else max(abs(value), abs(scale.parameter.nominal))
+def size_of(parameter: Parameter, value: float) -> float:
+    """Return what an interval is compared with: the value; if it may be zero, also that of the ``parameter`` before."""
+    return abs(value) if SharedScale(parameter).is_log else max(abs(value), abs(parameter.nominal))

@@ -8,7 +8,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
-from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
+from otolith.commissioning.shared_fit import DETERMINED, SharedFit, deviations, size_of
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult, gauss_newton
@@ -160,8 +160,7 @@ class ValueSearch:
     ) -> Iterator[str]:
         """Yield the values that depend on how far the measurements correct the twin."""
         for name, value in values.items():
-            size = size_of(SharedScale(self._problem.free[self._places[name]]), value)
-            if not name.startswith("_") and QUANTILE * spread[name] > DETERMINED * size:
+            if not name.startswith("_") and QUANTILE * spread[name] > DETERMINED * self._size(name, value):
                 unit = self._problem.free[self._places[name]].unit
                 yield f"{name} is {value:.3g} {unit}, but {others[name]:.3g} {unit} where measurements correct less"
 
@@ -236,7 +235,8 @@ class ValueSearch:
         guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), LAST_STEPS)
         cost = _cost(result)
         values = {name: float(guesses[0][ats[0]]) for name, ats in moved.items()}
-        sd, weakest = deviations(result, together, values, cost)
+        sizes = {name: self._size(name, value) for name, value in values.items()}
+        sd, weakest = deviations(result, together, sizes, cost)
         restored = [self._whole(guess, problem) for guess in guesses]
         return _Fitted(values, sd, weakest, cost, restored, _Stage(there, moved, parameters, guesses))
 
@@ -288,6 +288,9 @@ class ValueSearch:
         """Return the guess with the parameters that were held, at the places of all free ones."""
         values = {row.name: float(value) for row, value in zip(problem.free, guess, strict=False)}
         return np.array([values.get(row.name, row.nominal) for row in self._problem.free])
+
+    def _size(self, name: str, value: float) -> float:
+        return size_of(self._problem.free[self._places[name]], value)
 
     def _nominal(self, name: str) -> float:
         return self._problem.free[self._places[name]].nominal
