@@ -155,7 +155,8 @@ class _RecordSearch:
         for name in (*(row.name for row in twin.inputs), *(row.name for row in twin.outputs)):
             self.progress(f"values with the other sign of {name}")
             other = self.search([_negated(window, name) for window in windows]).run()
-            if other.is_followed and (not best.is_followed or _is_better(other.misfits, best.misfits)):
+            are_followed = best.is_followed and other.is_followed
+            if other.is_explained or (are_followed and _is_better(other.misfits, best.misfits)):
                 yield f"the twin explains the data with the other sign of {name}"
 
     def beside_components(self, best: OwnValues, windows: Sequence[Window]) -> OwnValues:
