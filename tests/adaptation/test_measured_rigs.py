@@ -12,8 +12,11 @@ import pytest
 from otolith.acquisition.window import Array
 from otolith.commissioning.identification import identify_noise
 from otolith.discovery.decision import WindowDecision
+from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import fit
 from otolith.machine import load_machine
+from otolith.twin.kernel import Excitation, kernel_of
 from tests.adaptation.measured_like import blamed, cut, reports
 from tests.variants import often, often_rows
 
@@ -153,6 +156,30 @@ def test_a_lab_motor_without_a_current_sensor_has_no_sensor_fault(tmp_path: Path
     assert not blamed(documents)
     for name, truth in TRUTH.items():
         assert documents[-1].parameters[name].value == pytest.approx(truth, rel=0.03)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.6, 0.8, 1.0, 1.1])
+@SEEDS
+def test_motors_that_move_alike_do_not_exclude_each_other(tmp_path: Path, seed: int, share: float) -> None:
+    """One step tells final speed and time constant: K, J and T_c lie on a long curved ridge, and a fit ends anywhere.
+
+    ``share`` is the inertia of another motor on the ridge, in that of the true one.
+    """
+    rig, voltage, constant = problem(tmp_path, "lab_motor", MOTOR), 6.8, TRUTH["K"] * np.sqrt(share)
+    final = (voltage - TRUTH["T_c"] * RESISTANCE / TRUTH["K"]) / TRUTH["K"]
+    other = np.array([constant, share * TRUTH["J"], constant * (voltage - constant * final) / RESISTANCE])
+    truth = np.array([TRUTH[parameter.name] for parameter in rig.free])
+    random, command = np.random.default_rng(seed), np.repeat([0.0, voltage], [75, 25])
+    every = np.array([[TRUTH["K"], RESISTANCE, TRUTH["J"], TRUTH["T_c"]]])
+    drive = Excitation.uniform(command[:, None], PERIOD, SUBSTEPS)
+    speed = kernel_of(rig.twin).simulate(every, np.zeros((1, 1)), drive)[0, :, 0]
+    values = np.column_stack([command, speed + 0.3 * random.normal(size=RECORDS)])
+    (window,) = cut(("u", "omega"), values, RECORDS, PERIOD)
+    fitted = fit(rig, window, initial_prior(rig), other, 0)
+    assert fitted.cost < 1.1
+    evidence = fitted.evidence()
+    misfit = evidence.residual + evidence.sqrt_information @ (np.append(truth, np.zeros(3)) - evidence.point)
+    assert misfit @ misfit < 27.9  # χ² with six degrees of freedom: one in 10,000
 
 
 @pytest.mark.full

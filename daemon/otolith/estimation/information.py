@@ -331,7 +331,7 @@ class MapObjective:
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
-        curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
+        curvature = linearisation_errors(self._objective, fit.guess[constant], fit.jacobian[:, constant])
         of_states = jacobian[:, count:] * (self.high - self.low)[count:]
         columns = np.concatenate([jacobian[:, :count], residuals[:, None], curvature], axis=1)  # J, r, N
         columns = eliminate_states(columns, of_states)
@@ -356,13 +356,16 @@ def eliminate_states(rows: Array, slopes: Array) -> Array:
     return np.asarray(rows - basis @ (basis.T @ rows))
 
 
-def second_order_change(objective: Objective, guess: Array, jacobian: Array) -> Array:
-    """Return the second-order change (residuals, directions) of the residuals, one standard deviation from ``guess``.
+def linearisation_errors(objective: Objective, guess: Array, jacobian: Array) -> Array:
+    """Return the errors (residuals, directions) of linearised residuals, one standard deviation from ``guess``.
 
-    ``jacobian`` (rows, guess) includes the rows of the prior.
+    Each is the mean of both sides, without what the linear window predicts there: their second-order change. A side
+    where a bound cuts the step off shows less, so the other one counts alone. ``jacobian`` (rows, guess) includes the
+    rows of the prior.
     """
+    count = objective.measured.size
     if not np.isfinite(jacobian).all():
-        return np.zeros((len(objective.measured.ravel()), 0))
+        return np.zeros((count, 0))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
     kept = singular > MIN_CURVED_SINGULAR * singular[0]
@@ -371,9 +374,12 @@ def second_order_change(objective: Objective, guess: Array, jacobian: Array) -> 
     inside = np.clip(around, objective.low, objective.high)
     with np.errstate(over="ignore", invalid="ignore"):
         residuals = objective.residuals(objective.predict(inside)).reshape(len(around), -1)
-        count = len(steps)
-        change = 0.5 * (residuals[:count] + residuals[count : 2 * count]) - residuals[-1]
-    return np.where(np.isfinite(change).all(axis=1)[:, None], change, 0.0).T
+        errors = (residuals - residuals[-1])[:-1] - (inside[:-1] - guess) @ jacobian[:count].T
+    above, below = np.split((inside == around).all(axis=1)[:-1], 2)  # whether a whole step is within the bounds
+    share = np.where(above == below, 0.5, np.where(above, 1.0, 0.0))[:, None]
+    upper, lower = np.split(errors, 2)
+    change = share * upper + (1.0 - share) * lower
+    return np.asarray(np.where(np.isfinite(change).all(axis=1)[:, None], change, 0.0).T)
 
 
 def _with_noise(root: Array, residual: Array, noise: Array) -> tuple[Array, Array]:
