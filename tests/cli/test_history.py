@@ -1,5 +1,6 @@
 """``otolith history``: table, CSV, JSON and Parquet, with a daemon running or not, and what cannot be read."""
 
+import contextlib
 import csv
 import json
 import os
@@ -16,9 +17,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli import common
+from otolith.cli.machines import last_spoken
 from otolith.cli.main import cli
-from otolith.health.schema import EventChange
-from otolith.storage.history import HOUR, history_path
+from otolith.cli.operation.history import end_of
+from otolith.health.limits import Level
+from otolith.health.schema import EventChange, HealthDocument
+from otolith.storage.history import HOUR, HistoryReader, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import state_directory
@@ -248,3 +252,47 @@ def test_a_command_that_may_not_use_the_state_of_the_service_says_so(
         error = CliRunner().invoke(cli, command, standalone_mode=False).exception
         assert isinstance(error, ServiceError)
         assert "line-7: state of a service, which root and its own user may read: try it with sudo" in str(error)
+
+
+def damage(written: HistoryWriter, count: int) -> None:
+    """The disk has damaged the newest reports; who writes them has the file open."""
+    with contextlib.closing(sqlite3.connect(written.reader.path)) as connection, connection:
+        connection.execute(
+            "UPDATE report SET text = substr(text, 1, 40) WHERE sequence IN "
+            "(SELECT sequence FROM report ORDER BY sequence DESC LIMIT ?)", (count,),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, COUNT], ids=["the newest", "all"])
+def test_a_damaged_report_prevents_no_command_that_does_without_it(written: HistoryWriter, count: int) -> None:
+    damage(written, count)
+    name = written.reader.last_changes().popitem()[0]
+    for arguments in (
+        ["history", MACHINE], ["history", MACHINE, "--csv"], ["history", MACHINE, "--json", "--since", "2023-01-31"],
+        ["event", "list", MACHINE], ["event", "acknowledge", MACHINE, name], ["event", "comment", MACHINE, name, "x"],
+        ["report", MACHINE, "--output", "-"],
+    ):  # fmt: skip
+        if count == 1 or arguments[0] != "report":  # a page is made of reports
+            done = CliRunner().invoke(cli, arguments, standalone_mode=False)
+            assert done.exception is None, arguments
+    assert list(last_spoken(MACHINE))
+
+
+def test_times_keep_language_and_zone_of_the_machine_if_a_report_is_damaged(written: HistoryWriter) -> None:
+    health = HealthDocument(state=Level.OK, since=0.0, reason="", parts={}, language="de", timezone="Asia/Tokyo")
+    now = time.time()
+    numbers = Numbers(now)
+    for report in documents(3, start=now, length=LENGTH):
+        written.add(numbers.number(report.model_copy(update={"health": health})))
+    written._write_waiting()
+    assert written.reader.language_and_zone() == ("de", "Asia/Tokyo")
+    damage(written, 1)
+    assert written.reader.language_and_zone() == ("de", "Asia/Tokyo")
+
+
+def test_a_copy_ends_with_its_last_window_also_if_that_is_damaged(written: HistoryWriter, tmp_path: Path) -> None:
+    end = written.reader.latest(1)[0].window.end
+    damage(written, 1)
+    written._close()
+    copy = shutil.copy(written.reader.path, tmp_path)
+    assert end_of(HistoryReader(Path(copy))) == end

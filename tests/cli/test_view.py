@@ -11,6 +11,8 @@ from unittest.mock import Mock
 import pytest
 from click.testing import CliRunner, Result
 
+from otolith.cli import common
+from otolith.cli.machines import zone_of_machine
 from otolith.cli.main import cli
 from otolith.cli.operation import view as module
 from otolith.cli.operation.view import END, HEADER_BYTES, MAGIC, MESSAGE
@@ -80,6 +82,41 @@ def made(folder: Path, key: str, age: float, mark: str = "") -> Path:
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(cli, ["view", *arguments], standalone_mode=False)
+
+
+def service_of_tokyo(services: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recording of the instance ``press-3`` of the service; the machine in its file has another name."""
+    file = services.with_name("etc") / "press-3.toml"
+    file.parent.mkdir()
+    file.write_text('[machine]\nsite = "hall"\nname = "motor"\ntimezone = "Asia/Tokyo"\n', encoding="utf-8")
+    monkeypatch.setattr(common, "INSTALLED", file.parent)
+    monkeypatch.setattr(common, "SERVICES", services)
+    return made(services / "press-3" / "recordings", "hall.motor", 60.0)
+
+
+@pytest.mark.parametrize("name", ["press-3", "motor", "hall.motor"])
+@pytest.mark.parametrize("may_write", [True, False], ids=["root", "member of the group"])
+def test_recordings_of_a_service_are_shown_to_all_who_may_read_them(
+    services: Path, monkeypatch: pytest.MonkeyPatch, name: str, *, may_write: bool
+) -> None:
+    """The tests may run as root, who may write everywhere: ``os.access`` is replaced."""
+    recording, real = service_of_tokyo(services, monkeypatch), os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: real(path, mode) and (may_write or not mode & os.W_OK))
+    done = run(name, "--list")
+    assert done.exception is None
+    assert_says(done.stdout, "JST", str(recording))
+
+
+@pytest.mark.parametrize("name", ["press-3", "motor"])
+def test_what_a_command_finds_later_is_what_it_finds_at_first(
+    services: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """``--live`` searches again and again: the zone of the machine must not make its state that of this user."""
+    service_of_tokyo(services, monkeypatch)
+    assert zone_of_machine(name) == "Asia/Tokyo"
+    assert "STATE_DIRECTORY" not in os.environ
+    newer = made(services / "press-3" / "recordings", "hall.motor", 0.0)
+    assert module.Recordings.search(name).files[0].path == newer
 
 
 def arguments_of(shown: Path) -> str:

@@ -3,6 +3,7 @@
 A service may also be given by its own name, that of its machine file in ``/etc/otolith``.
 """
 
+import math
 import os
 import time
 import tomllib
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from otolith.cli import common
 from otolith.cli.terminal import echo
-from otolith_drivers.errors import ConfigurationError, nearest, some_names
+from otolith_drivers.errors import ConfigurationError, OtolithError, nearest, some_names
 
 if TYPE_CHECKING:
     from otolith.storage.history import HistoryReader
@@ -124,19 +125,22 @@ def reader_of(text: str) -> "HistoryReader":
         common.use_state_of_service(Path(text))
         names = load_machine(Path(text), with_driver=False).file.machine
         return HistoryReader(history_path(names.site, names.name))
-    is_instance = Path(os.environ.get("STATE_DIRECTORY", "")).name == text  # which systemd names so
-    chosen = {reader: MachineIdentity(reader.site, reader.machine) for reader in own_histories()}
-    chosen = {reader: identity for reader, identity in chosen.items() if is_instance or identity.is_named(text)}
-    if (reader := _single(text, chosen)) is not None:
+    if (reader := _own_reader(text)) is not None:
         return reader
     service = service_file(text)
     if common.use_state_of_service(service.stem if service else text):
         return reader_of(text)
-    demos = [reader for reader in _demos() if MachineIdentity(reader.site, reader.machine).is_named(text)]
-    if not demos:
+    if not (demos := _demos_of(text)):
         raise ConfigurationError(none_text(text, "history"))
     echo(f"no machine is named {text!r}: this is the demo in {demos[-1].path.parents[1]}", err=True)
     return demos[-1]
+
+
+def _own_reader(text: str) -> "HistoryReader | None":
+    """Return the history in the state directory of a machine or service of this name; raise as :func:`reader_of`."""
+    is_instance = Path(os.environ.get("STATE_DIRECTORY", "")).name == text  # which systemd names so
+    known = {reader: MachineIdentity(reader.site, reader.machine) for reader in own_histories()}
+    return _single(text, {reader: name for reader, name in known.items() if is_instance or name.is_named(text)})
 
 
 def none_text(text: str, what: str) -> str:
@@ -173,16 +177,26 @@ def _demos() -> "list[HistoryReader]":
     return [HistoryReader(path) for path in sorted(paths)]
 
 
+def _demos_of(text: str) -> "list[HistoryReader]":
+    return [reader for reader in _demos() if MachineIdentity(reader.site, reader.machine).is_named(text)]
+
+
 def zone_of_machine(text: str) -> str | None:
     """Return the zone in which people read the times of a machine, given by its file or name.
 
-    None for that of this computer: nothing is known of the machine, or it has no zone.
+    None for that of this computer: nothing is known of the machine, or it has no zone. Of a service its machine file
+    says it: its history is closed to most of those who may see its recordings.
     """
-    from otolith.cli.operation.history import texts_and_zone
-
     try:
-        return texts_and_zone(reader_of(text))[1] if text and not is_file(text) else _zone_of_file(Path(text))
-    except (ConfigurationError, OSError, ValueError):
+        if not text:
+            return None
+        reader = None if is_file(text) else _own_reader(text)
+        file = Path(text) if is_file(text) else service_file(text) if reader is None else None
+        if file is not None:
+            return _zone_of_file(file)
+        readers = _demos_of(text) if reader is None else [reader]
+        return readers[-1].language_and_zone()[1] if readers else None
+    except (OtolithError, OSError, ValueError):
         return None
 
 
@@ -216,17 +230,17 @@ def last_spoken(text: str = "*") -> Iterable[str]:
 
     Without any, that is the last demo.
     """
-    from otolith.health.text import duration_text, zone_of
+    from otolith.health.text import duration_text
     from otolith.health.times import clock_in
 
     for reader in own_histories() or _demos()[-1:]:
         identity = MachineIdentity(reader.site, reader.machine)
         if text in {"*", "*.*"} or identity.is_named(text):
             try:
-                reports = reader.latest(1)
+                last, labels, (_, zone) = reader.last(), reader.labels(), reader.language_and_zone()
             except ConfigurationError:
                 continue
-            for report in reports:
-                end, name = report.window.end, identity.key
-                when, ago = clock_in(zone_of(report))(end), duration_text(time.time() - end)
+            if math.isfinite(last):
+                end, name = labels.unix(last), identity.key
+                when, ago = clock_in(zone)(end), duration_text(time.time() - end)
                 yield f"{name} spoke last at {when}, {ago} ago: 'otolith report {name}' shows it"

@@ -25,6 +25,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import (
     EventDocument,
     FindingDocument,
+    Language,
     NumberDocument,
     ParameterDocument,
     PartDocument,
@@ -51,7 +52,11 @@ BUSY_TIMEOUT = 2.0  # s to wait for another process that reads or writes
 CHECKPOINT_BYTES = 1 << 20  # of the write-ahead log, after which it is merged
 COMPRESSION = 1  # level of zlib
 LATEST_CHANGES = 2000  # changes of events that are searched for those that were left open
+SEARCHED_REPORTS = 10  # of which one that the disk has not damaged has the language and the zone
 FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
+
+# What the content of a row raises that the disk has damaged.
+DAMAGES = (zlib.error, ValueError, TypeError, LookupError, RecursionError)
 
 # By sequence: versions without labels wrote the time of a wrong clock.
 _SINCE = "WHERE sequence >= (SELECT min(sequence) FROM event WHERE time >= ?)"
@@ -388,6 +393,15 @@ class HistoryReader:
             raise ConfigurationError(f"{self.path}: cannot be read: the disk has damaged the last {len(rows)} reports")
         return reports
 
+    def language_and_zone(self) -> tuple[Language | None, str | None]:
+        """Return language and zone of the machine as its newest undamaged report has them; None where it has none."""
+        unpacked = Unpacker()
+        for (text,) in self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", SEARCHED_REPORTS):
+            with contextlib.suppress(*DAMAGES, ConfigurationError):
+                health = ReportDocument.from_json(unpacked(text)).health
+                return (None, None) if health is None else (health.language, health.timezone)
+        return None, None
+
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
     ) -> list[str]:
@@ -420,7 +434,7 @@ class HistoryReader:
         for row in rows:
             try:
                 contents.append(parse(*row))
-            except (zlib.error, ValueError, TypeError, LookupError, RecursionError):
+            except DAMAGES:
                 damaged += 1
         if damaged:
             log.warning("%s: %d rows that the disk has damaged are left out", self.path, damaged)

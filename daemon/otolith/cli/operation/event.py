@@ -13,7 +13,7 @@ import click
 
 from otolith.cli.common import AS_JSON, local_time
 from otolith.cli.machines import reader_of
-from otolith.cli.operation.history import SPANS, texts_and_zone
+from otolith.cli.operation.history import SPANS
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.outside_text import SURROGATE
 
@@ -198,7 +198,7 @@ def _known(machine: str) -> _Known:
         events |= {item.id: item for item in learned.health.open_events if item.id not in events}
         labels = learned.clock.labels if not has_history and learned.clock is not None else labels
     taken, shelves = (learned.health.taken, learned.health.shelves) if learned else ((), {})
-    zone = texts_and_zone(reader)[1] if has_history else next((row.timezone for row in events.values()), None)
+    zone = reader.language_and_zone()[1] if has_history else next((row.timezone for row in events.values()), None)
     return _Known(reader.machine, file, events, labels, frozenset(taken), shelves, zone)
 
 

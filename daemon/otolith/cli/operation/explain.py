@@ -100,9 +100,9 @@ def _language(machine: str | None, reader: "HistoryReader | None") -> "Language"
 def _reported(reader: "HistoryReader") -> "Iterator[Language]":
     """Yield the language of the last report of a history, if there is one that can be read."""
     with contextlib.suppress(OtolithError):
-        for report in reader.latest(1) if reader.path.is_file() else ():
-            if report.health is not None:
-                yield report.health.language
+        language = reader.language_and_zone()[0] if reader.path.is_file() else None
+        if language is not None:
+            yield language
 
 
 def _own_rules(reader: "HistoryReader | None", names: tuple[str, ...]) -> "tuple[Rule, ...]":

@@ -110,7 +110,7 @@ def history(
     reader = reader_of(machine)
     _check_names(names, reader.names())
     end = end_of(reader)
-    begin = since.before(end, texts_and_zone(reader)[1])
+    begin = since.before(end, reader.language_and_zone()[1])
     events = [] if names and not only_events else reader.events(begin)
     if only_events and as_csv:
         _print_events(events)
@@ -139,8 +139,8 @@ def end_of(reader: "HistoryReader") -> float:
     """Return the present time, in Unix s; of a history that no daemon continues the end of its last window."""
     from otolith.storage.history import history_directory
 
-    latest = [] if reader.path.parent == history_directory() else reader.latest(1)
-    return latest[0].window.end if latest else time.time()
+    last = -math.inf if reader.path.parent == history_directory() else reader.last()
+    return reader.labels().unix(last) if math.isfinite(last) else time.time()
 
 
 def interval_since(reader: "HistoryReader", since: float, end: float) -> str:
@@ -234,9 +234,11 @@ def _print_table(
 ) -> None:
     from otolith.cli.console import Localised, Terminal
     from otolith.cli.operation.event_table import event_table, print_changes, print_findings
+    from otolith.health.text import texts_in
     from otolith.health.times import moment_text
 
-    console, (say, zone) = Terminal(highlight=True), texts_and_zone(reader)
+    console, (language, zone) = Terminal(highlight=True), reader.language_and_zone()
+    say = texts_in(language or "en")
     first = min((sample.time for sample in samples), default=since)
     values = say("values_per", interval=say.translated(interval)) if samples else ""
     begin = moment_text(max(first, since), zone)
@@ -258,14 +260,6 @@ def _print_table(
             console.print(say("findings_counted", count=len(findings)))
     if not samples and not events:
         echo("no values or events since then", err=True)
-
-
-def texts_and_zone(reader: "HistoryReader") -> "tuple[Texts, str | None]":
-    """Return the texts in the language of the machine, and the zone of its times, as its last report has them."""
-    from otolith.health.text import texts_in
-
-    healths = [report.health for report in reader.latest(1) if report.health]
-    return (texts_in(healths[0].language), healths[0].timezone) if healths else (texts_in("en"), None)
 
 
 def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
@@ -329,7 +323,7 @@ def report(machine: str, since: Since, output: Path | None, opens: bool) -> None
         raise click.UsageError("--open needs a file: give another --output than '-'")
     reader, now = reader_of(machine), time.time()
     end = end_of(reader)
-    begin = since.before(end, texts_and_zone(reader)[1])
+    begin = since.before(end, reader.language_and_zone()[1])
     if begin >= now:
         raise click.BadParameter("lies in the future", param_hint="'--since'")
     content = page_of(reader, begin, end)
