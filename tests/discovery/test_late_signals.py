@@ -163,11 +163,18 @@ sample_period = "5 s"
 """
 
 
-SLOW = [(4, "T"), (4, "P"), (5, "T"), (6, "P")]
+# A third signal that is zero but for its noise shows no delay of its own.
+WITH_SUN = (
+    ('power of the heater" }', 'power of the heater" }\nS = { unit = "W", hold = "foh", meaning = "heat of the sun" }'),
+    ("(P - h", "(P + S - h"),
+)
+SLOW = [(4, "T", False), (4, "P", False), (4, "T", True), (5, "T", False), (6, "P", False), (5, "P", True)]
 
 
-@pytest.mark.parametrize(("seed", "name"), often_rows(SLOW[:2], SLOW))
-def test_a_delay_of_some_samples_of_a_slow_machine_is_named(tmp_path: Path, seed: int, name: str) -> None:
+@pytest.mark.parametrize(("seed", "name", "has_sun"), often_rows(SLOW[:3], SLOW))
+def test_a_delay_of_some_samples_of_a_slow_machine_is_named(
+    tmp_path: Path, seed: int, name: str, has_sun: bool
+) -> None:
     """Samples come every 5 s, so a delay of 20 s is one of four samples. Of two signals the late one is named alone.
 
     That the other is early would be the same statement once more, and no delay could be written under it.
@@ -179,9 +186,13 @@ def test_a_delay_of_some_samples_of_a_slow_machine_is_named(tmp_path: Path, seed
         rises.append(decay * rises[-1] + (1.0 - decay) * value / loss)
     heat = np.array(rises) + 293.0 + random.normal(0.0, 0.02, len(power))
     rows = {"T": (power[late:], heat[:-late]), "P": (power[:-late], heat[late:])}[name]
-    lines = [f"{step * at},{own[0]},{own[1]:.4f}" for at, own in enumerate(zip(*rows, strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(["t,P,T", *lines]) + "\n", encoding="utf-8")
-    (tmp_path / "block.toml").write_text(BLOCK, encoding="utf-8")
+    sun = random.normal(0.0, 0.5, len(rows[0]))
+    lines = [f"{step * at},{own[0]},{own[1]:.4f},{own[2]:.3f}" for at, own in enumerate(zip(*rows, sun, strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,P,T,S", *lines]) + "\n", encoding="utf-8")
+    block = BLOCK
+    for before, after in WITH_SUN if has_sun else ():
+        block = block.replace(before, after)
+    (tmp_path / "block.toml").write_text(block, encoding="utf-8")
     (tmp_path / "heater.toml").write_text(HEATER, encoding="utf-8")
     documents = replayed(load_machine(tmp_path / "heater.toml", with_driver=False), tmp_path / "log.csv")
     assert len(documents) >= 7

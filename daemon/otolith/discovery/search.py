@@ -230,9 +230,11 @@ def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]
     """Return the hypotheses that one signal is late or early against all others, for those of the largest ``gains``.
 
     A signal is early if all others are late by the same time. If only one other shows a delay at all, that one is late.
+    A signal that shows none has a gain by chance: χ² of one degree of freedom times the variance that the null leaves.
     """
     least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
-    may_be_early = sum(gain > 0.0 for gain in gains.tolist()) > 2
+    by_chance = DECISIVE * discount(null.chi_square, null.fit.count)
+    may_be_early = sum(gain > by_chance for gain in gains.tolist()) > 2
     return [
         _late_signal(null, index, may_be_early=may_be_early)
         for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist()
