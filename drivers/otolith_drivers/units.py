@@ -78,6 +78,8 @@ FOLDED = _by_spelling("""
 """)
 """pint's names by spellings in any capitals, written here in small letters."""
 
+SAME = 1e-9  # difference of the factors of one unit that is written in two ways: rounding
+
 UNCLEAR = {"grad": ("degree", "gon"), "gradian": ("degree", "gon"), "ton": ("tonne", "short_ton")}
 """Units with several meanings of one dimension, by their exact spelling."""
 
@@ -282,6 +284,12 @@ def factor(source: str, target: str) -> tuple[float, float]:
     if not math.isclose(two - one, one - zero, rel_tol=1e-6):
         raise ValueError(f"unit {source!r} is logarithmic: log the quantity itself, in {target!r}")
     return float(one - zero), float(zero)
+
+
+def are_equal(one: str, other: str, target: str) -> bool:
+    """Return whether two units of a quantity in ``target`` are the same; raise ValueError if one is none of it."""
+    scales, offsets = zip(factor(one, target), factor(other, target), strict=True)
+    return math.isclose(*scales, rel_tol=SAME) and math.isclose(*offsets, rel_tol=SAME, abs_tol=SAME * abs(scales[0]))
 
 
 def to_base(text: str) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from otolith_drivers.config_files import Range
 from otolith_drivers.errors import ConfigurationError, nearest, shown
 from otolith_drivers.replay.readers import Array, seen
 from otolith_drivers.replay.table_times import BESIDE_NAME, contradiction, date_column, rises_evenly
-from otolith_drivers.units import factor, is_unit
+from otolith_drivers.units import are_equal, factor, is_unit
 
 # Engineering choice: a thousand columns need some 20 000. Bounds the memory for a file without line ends.
 MAX_LINE = 100_000  # characters
@@ -201,7 +201,7 @@ def _columns(
         stated = written or beside.get(index)
         unit = request.written or stated
         is_stated |= signal == TIME and unit is not None
-        if request.written and stated and is_unit(stated) and not _are_equal(request.written, stated):
+        if request.written and stated and _is_contradicted(request.written, stated, request.unit):
             fault = f"the table says {shown(stated)}, the machine file unit = {shown(request.written)}"
             remedy = f"remove unit from the {'time of the ' if signal == TIME else ''}signal, or correct the table"
             raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {fault}: {remedy}")
@@ -212,10 +212,13 @@ def _columns(
     return columns, is_stated
 
 
-def _are_equal(one: str, other: str) -> bool:
-    """Whether two units are the same, however they are written."""
+def _is_contradicted(written: str, stated: str, target: str) -> bool:
+    """Whether a table states another unit than the machine file, for a signal in the unit ``target``.
+
+    What is no unit of such a signal, as the phase in ``U (A)``, states nothing.
+    """
     try:
-        return factor(one, other) == (1.0, 0.0)
+        return not are_equal(written, stated, target)
     except ValueError:
         return False
 

@@ -93,6 +93,29 @@ def test_a_unit_that_the_table_contradicts_is_refused(
         assert next(iter(reader.chunks())).times[1] == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize(
+    ("header", "unit", "of_file", "factor"),
+    [
+        ("x (C)", "K", "°C", 1.0),  # of a temperature, C is no coulomb
+        ("x (C)", "degC", "degC", 1.0),
+        ("x (1/min)", "rad/s", "rpm", np.pi / 30.0),
+        ("x [Umdr./min]", "rad/s", "rpm", np.pi / 30.0),
+        ("x (A)", "V", "mV", 1e-3),  # a phase
+        ("x (V)", "A", "A", 1.0),
+        ("x (Hz)", "rad/s", "rpm", np.pi / 30.0),  # which leaves open whether turns are meant
+    ],
+)
+def test_a_unit_that_the_header_does_not_contradict_is_that_of_the_machine_file(
+    header: str, unit: str, of_file: str, factor: float, tmp_path: Path
+) -> None:
+    path = table(tmp_path, f"t (S),{header}", [f"{row},{row}" for row in range(10)])
+    source = TableSource.model_validate({"unit": of_file, "time": {"column": "t", "unit": "s"}})
+    with open_log(path, Setup((Signal(name="x", unit=unit, source=source),), tmp_path, 0.01)) as reader:
+        rows = next(iter(reader.chunks()))
+    assert np.diff(rows.columns["x"]) == pytest.approx(factor)
+    assert np.diff(rows.times) == pytest.approx(1.0)
+
+
 def test_columns_with_one_name_are_asked_about(tmp_path: Path) -> None:
     with raises_saying(ConfigurationError, "table.csv:1", "2 columns", "'Name'", 'time = "'):
         samples(scope(tmp_path), fast={}, slow={})
