@@ -346,7 +346,7 @@ def _plan(
         for name, row in free.items()
     }
     own = _own_values(file, twin, complete)
-    parameters = _waiting(parameters, own | _with_own_limits(file))
+    parameters = _waiting(parameters, own)
     for name, quantity in parameters.items():
         table = file.parameters.get(name, ParameterTable())
         parameters[name] = _with_temperature(quantity, free[name], table, twin, context)
@@ -370,11 +370,13 @@ def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> fr
     """Return the parameters whose nominal values are those of this machine, so that they may be judged by them.
 
     The file states them, or the user's own twin; a twin of the library has those of an example. A friction that stands
-    for an unmeasured load too is not known from a data sheet of the motor.
+    for an unmeasured load too is not known from a data sheet of the motor, unless limits are stated beside its value.
     """
-    written = {name for name, table in file.parameters.items() if table.value is not None}
+    tables = file.parameters
+    written = {name for name, table in tables.items() if table.value is not None}
+    limited = {name for name in written if tables[name].watch is not None or tables[name].act is not None}
     written |= {row.name for row in complete.parameters} if file.twin.file is not None else set()
-    return frozenset(name for name in written if not stands_for_load(name, twin, complete))
+    return frozenset(name for name in written if name in limited or not stands_for_load(name, twin, complete))
 
 
 def stands_for_load(name: str, twin: Definition, complete: Definition) -> bool:
@@ -383,20 +385,14 @@ def stands_for_load(name: str, twin: Definition, complete: Definition) -> bool:
     return own is not None and twin.parameter(name) != own
 
 
-def _with_own_limits(file: MachineFile) -> frozenset[str]:
-    """Return the parameters whose limits the file has."""
-    tables = file.parameters.items()
-    return frozenset(name for name, table in tables if table.watch is not None or table.act is not None)
-
-
 def _waiting(quantities: Mapping[str, MonitoredQuantity], judged: Collection[str]) -> dict[str, MonitoredQuantity]:
-    """Return the quantities; the limits in percent of those that are not ``judged`` wait for a baseline."""
+    """Return the quantities; those that are not ``judged`` have an example's value, whose percentages wait."""
     found = dict(quantities)
     for name in quantities.keys() - judged:
         limits, quantity = {True: list[Limit](), False: list[Limit]()}, quantities[name]
         for limit in quantity.limits:
             limits[limit.is_relative].append(limit)
-        found[name] = replace(quantity, limits=tuple(limits[False]), waiting=tuple(limits[True]))
+        found[name] = replace(quantity, limits=tuple(limits[False]), waiting=tuple(limits[True]), is_example=True)
     return found
 
 

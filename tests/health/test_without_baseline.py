@@ -118,7 +118,6 @@ def test_the_example_of_a_twin_is_no_baseline(change: float, tmp_path: Path) -> 
     [
         'D = { value = "0.00143 N*m*s/rad", estimate = true }',
         'D = { act = "0.0029 N*m*s/rad" }',
-        'D = { act = "+100 %" }',
     ],
 )
 def test_what_the_machine_file_states_is_a_baseline(written: str, tmp_path: Path) -> None:
@@ -130,6 +129,24 @@ def test_what_the_machine_file_states_is_a_baseline(written: str, tmp_path: Path
     assert document.health is not None
     assert document.health.parts["bearing"].state is Level.OK
     assert document.health.parts["winding"].state is Level.NO_DATA
+
+
+def test_a_percentage_of_an_example_waits_whoever_wrote_it(tmp_path: Path) -> None:
+    text = '[machine]\nname = "axis"\n[twin]\nname = "servo_axis"\n[parameters]\nM = { act = ["-10 %", "+10 %"] }\n'
+    plan = machine_of(tmp_path, text).plan
+    document = shown(plan, M=60.0)
+    assert not document.events
+    assert value_cells(document.parameters["M"])[-1] == ""
+    known = with_baselines(plan, baselines({"M": 60.0}))
+    assert not shown(known, M=60.0).events
+    (event,) = shown(known, M=70.0).events
+    assert event.state is Level.ACT
+
+
+def test_the_change_from_an_example_is_none_of_the_machine_without_limits_as_well(tmp_path: Path) -> None:
+    plan = machine_of(tmp_path, '[machine]\nname = "axis"\n[twin]\nname = "servo_axis"\n').plan
+    assert not plan.parameters["M"].has_limits
+    assert value_cells(shown(plan, M=60.0).parameters["M"])[-1] == ""
 
 
 def test_the_values_of_an_own_twin_are_those_of_the_machine(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ from otolith.estimation.window_fit import (
     unbridged_gap,
 )
 from otolith.health.events import HealthState, assess
-from otolith.health.schema import Report
+from otolith.health.schema import Report, window_document
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
 UNUSED = "nothing is estimated from this window: "
@@ -60,7 +60,7 @@ UNUSED = "nothing is estimated from this window: "
 
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
     """Return the state after ``window``, and the report of it."""
-    window, shortened = last_records(window)
+    whole, (window, shortened) = window, last_records(window)
     posterior = state.posterior.without_expired(window.start)
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
@@ -72,7 +72,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
-    health, document = assess(state.plan, state.health, report.document)
+    document = report.document.model_copy(update={"window": window_document(whole)})  # reports come as often as windows
+    health, document = assess(state.plan, state.health, document)
     return _next_state(state, result, previous, health), replace(report, document=document)
 
 

@@ -95,7 +95,7 @@ def last_records(window: Window) -> tuple[Window, tuple[str, ...]]:
     """Return the window, or its last records if it has more than memory suffices for, and a note of that."""
     if window.records <= MAX_RECORDS:
         return window, ()
-    length = f"{MAX_RECORDS * window.sample_period:.3g} s"
+    length = f"{MAX_RECORDS * window.sample_period:g} s"
     note = (
         f"only the last {MAX_RECORDS} of {window.records} records are estimated from, as more need too much memory; "
         f"write at most {length} as length under [window], or a longer sample_period"

@@ -349,7 +349,7 @@ def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str
     """
     quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
     judged: dict[str, float | bool] = {"baseline": quantity.nominal} if quantity.has_baseline else {}
-    judged |= {"is_example": True} if quantity.waiting else {}
+    judged |= {"is_example": True} if quantity.is_example else {}
     if quantity.limits:
         worst = min(quantity.limits, key=lambda row: (-row.level.rank, abs(row.value - quantity.nominal)))
         judged["limit"] = worst.value

@@ -68,6 +68,7 @@ class MonitoredQuantity:
     temperature_coefficient: float = 0.0  # Relative change per kelvin
     temperature: str = ""  # Signal of the temperature, K; empty if it is not measured
     reference: float = 293.15  # Temperature for which nominal value and limits are stated, K
+    is_example: bool = False  # Whether nominal is of the twin's example, which is another machine
     has_baseline: bool = False  # Whether nominal is a value from commissioning instead of that of the machine file
 
     def referred(self, value: float, sd: float, observed: Mapping[str, float]) -> tuple[float, float] | None:

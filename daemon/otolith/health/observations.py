@@ -170,7 +170,7 @@ def _of_finding(
         part = quantity.part
         passed, limit = quantity.level(value.value, value.sd, *_held(finding.id, before, past))
         # The value of an example is that of the file to complete, and none of the machine.
-        of_example = Level.HINT if is_from_start and quantity.waiting else level
+        of_example = Level.HINT if is_from_start and quantity.is_example else level
         level = passed if quantity.limits else of_example
         deviation = value.value - quantity.nominal
         features = replace(features, side="below" if deviation < 0.0 else "above", manner="step")

@@ -400,7 +400,7 @@ def with_baseline(quantity: MonitoredQuantity, baseline: Baseline | None) -> Mon
         replace(limit, value=ratio * limit.value) if limit.is_relative else limit
         for limit in (*quantity.limits, *quantity.waiting)
     )
-    return replace(quantity, nominal=baseline.value, limits=limits, waiting=(), has_baseline=True)
+    return replace(quantity, nominal=baseline.value, limits=limits, waiting=(), is_example=False, has_baseline=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,11 +152,11 @@ def _parameter(machine: LoadedMachine, parameter: Parameter, written: Any) -> It
     yield _header(("parameters", parameter.name))
     yield _prose(parameter.meaning)
     yield from _written(table)
-    waits = bool({**machine.plan.known, **machine.plan.parameters}[parameter.name].waiting)
+    is_example = {**machine.plan.known, **machine.plan.parameters}[parameter.name].is_example
     for name, value in defaults.items():
         if name not in table:
-            # Written into the file, they would be those of this machine, and judged at once.
-            of_example = waits and name in {"value", "watch", "act"}
+            # Written into the file, the value would be that of this machine, and judged.
+            of_example = is_example and name == "value"
             yield _prose(f"{name} = {value}, of the twin's example") if of_example else _default(name, value)
     yield ""
 
