@@ -16,6 +16,8 @@ from otolith.cli.commissioning.commission import Manner
 from otolith.cli.commissioning.noise import HealthyLog, UnusableData
 from otolith.cli.main import cli
 from otolith.commissioning import own_values
+from otolith.commissioning.delays import IdentifiedDelays
+from otolith.commissioning.identification import AT_REST, CONSTANT, IdentifiedNoise, NoiseLevel
 from otolith.commissioning.value_search import OwnValue, OwnValues
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded, replay_recorder
@@ -150,6 +152,25 @@ def test_a_running_machine_gets_noise_into_its_file(ran: Path) -> None:
     assert_says(result.stderr, str(ran), "[noise]", "[process_noise]")
     assert float(str(tables(ran)["noise"]["i"]).split()[0]) == pytest.approx(0.005, rel=0.2)
     load_machine(ran, with_driver=False)
+
+
+@pytest.mark.parametrize("stated", ["", '[process_noise]\nomega = "0.5 rad/s^1.5"\n'], ids=["none", "a level"])
+@pytest.mark.parametrize("has_sensors", [True, False], ids=["at rest", "and constant"])
+def test_levels_that_a_record_does_not_determine_stay_as_they_are(
+    tmp_path: Path, stated: str, *, has_sensors: bool
+) -> None:
+    """Nothing moves in the record: it shows no process noise, and perhaps not even that of a sensor."""
+    file = tmp_path / "machine.toml"
+    file.write_text(f"{MACHINE.read_text(encoding='utf-8')}\n{stated}", encoding="utf-8")
+    machine, before = load_machine(file, with_driver=False), tables(file)
+    sd, remark = (1e-4, "") if has_sensors else (None, CONSTANT)
+    outputs = tuple(NoiseLevel(name, 0.006, sd, remark) for name in ("i", "omega"))
+    states = tuple(NoiseLevel(name, 0.0, None, AT_REST) for name in ("i", "omega"))
+    identified = IdentifiedNoise(outputs, states, (), windows=5)
+    written = commission_module._with_noise_and_delays(machine, identified, IdentifiedDelays(()))
+    assert written.problem.process_noise == machine.problem.process_noise
+    noise = {"i": "0.006 A", "omega": "0.006 rad/s"} if has_sensors else {}
+    assert tables(file) == before | {"noise": before["noise"] | noise}
 
 
 LIMITS = {"watch": ["-10 %", "+10 %"], "act": ["-20 %", "+20 %"], "low": "4 ohm"}

@@ -43,6 +43,12 @@ def test_a_new_key_is_the_last_of_its_table_and_a_new_table_the_last_of_the_file
     assert text.endswith('i = "5 mA"\nomega = "1 rad/s"\n\n[process_noise]\ni = "1 A/s^0.5"\n')
 
 
+@pytest.mark.parametrize("table", ["noise", "process_noise"])
+def test_without_a_key_the_file_stays_as_it_is(table: str) -> None:
+    for text in (TEXT, TEXT.replace('i = "5 mA"\n', ""), TEXT.partition("[noise]")[0]):
+        assert with_keys(text, table, {}) == text
+
+
 COMMENTED = [
     ('i = "5 mA"  # data sheet, page 3', "noise", "i"),
     ('R_a = "6.5 ohm"     # by a bridge; at 20 °C', "parameters", "R_a"),

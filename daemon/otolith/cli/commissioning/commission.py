@@ -262,7 +262,8 @@ def _with_noise_and_delays(
 
     written = _written(machine, changed)
     done = [f"{counted(len(lines), 'level')} in [{table}]" for table, lines in tables.items() if lines]
-    echo(f"{machine.path}: written: {', '.join(done)}", err=True)
+    said = f"written: {', '.join(done)}" if done else "the data determine no level: all stay as they are"
+    echo(f"{machine.path}: {said}", err=True)
     for item in late:
         said = f'{item.name} is {1e3 * item.value:.3g} ms late: written: delay = "{1e3 * item.value:.4g} ms"'
         echo(f"{machine.path}: {said} under [signals]", err=True)

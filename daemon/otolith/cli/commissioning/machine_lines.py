@@ -37,12 +37,14 @@ class Unchangeable(ValueError):  # noqa: N818 - it is told as part of another er
 
 
 def with_keys(text: str, table: str, lines: Mapping[str, NewLine]) -> str:
-    """Return the file with keys of a table, which is added at the end if it is missing.
+    """Return the file with keys of a table, which is added at the end if it is missing; as it is without any.
 
     A key replaces its line, or the one with ``#`` that has its default. What a person wrote behind a replaced value
     stays there, after the remark. A table that is there keeps its keys, and gets those that it lacks. Raises
     Unchangeable.
     """
+    if not lines:
+        return text
     rows = text.split("\n")
     wanted = copy.deepcopy(tomllib.loads(text))
     inside = wanted.setdefault(table, {})

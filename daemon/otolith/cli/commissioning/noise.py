@@ -188,24 +188,22 @@ def level_rows(
 ) -> dict[str, list[tuple[str, str, str]]]:
     """Return what belongs into the tables [noise] and [process_noise]: keys, values and remarks.
 
-    What ``is_written`` into a file has no level that the data do not determine: it is the one of the file.
+    What ``is_written`` into a file has no level that the data do not determine: that of the file stays.
     """
     twin, problem = machine.twin, machine.problem
-    outputs = zip(identified.outputs, problem.noise, strict=True)
-    states = zip(identified.states, problem.process_noise or (0.0,) * len(twin.states), strict=True)
     inputs = zip(twin.inputs, identified.applied(problem).levels, strict=False)
     shown = {source.name for source in identified.inputs if source.is_significant}
 
-    def is_row(level: "NoiseLevel", before: float) -> bool:
-        return not is_written or level.sd is not None or level.value != before
+    def kept(levels: "Sequence[NoiseLevel]") -> "list[NoiseLevel]":
+        return [level for level in levels if not is_written or level.sd is not None]
 
-    rows = [_row(level, twin.unit_of(level.name)) for level, before in outputs if is_row(level, before)]
+    rows = [_row(level, twin.unit_of(level.name)) for level in kept(identified.outputs)]
     rows += [
         _input_row(machine, identified, source, level)
         for source, level in inputs
         if level and (not is_written or source.name in shown)
     ]
-    process = [_row(own, f"{twin.unit_of(own.name)}/s^0.5") for own, before in states if is_row(own, before)]
+    process = [_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in kept(identified.states)]
     return {"noise": rows, "process_noise": process}
 
 
