@@ -30,7 +30,7 @@ i = "5 mA"
 def test_a_key_replaces_its_line_or_its_default() -> None:
     text = with_keys(TEXT, "parameters", {"R_a": NewLine("2.1 ohm", "new"), "L_a": NewLine({"value": "0.1 H"})})
     lines = text.splitlines()
-    assert 'R_a = "2.1 ohm"  # new' in lines
+    assert 'R_a = "2.1 ohm"  # otolith commission: new' in lines
     assert 'L_a = { value = "0.1 H" }  # by a bridge' in lines
     kept = [line for line in TEXT.splitlines() if "R_a" not in line and "L_a" not in line]
     assert [line for line in lines if "R_a" not in line and "L_a" not in line] == kept
@@ -50,30 +50,46 @@ def test_without_a_key_the_file_stays_as_it_is(table: str) -> None:
 
 
 COMMENTED = [
-    ('i = "5 mA"  # data sheet, page 3', "noise", "i"),
-    ('R_a = "6.5 ohm"     # by a bridge; at 20 °C', "parameters", "R_a"),
-    ("R_a = '6 # ohm' # by a bridge", "parameters", "R_a"),
+    ('i = "5 mA"  ', "# data sheet, page 3", "noise", "i"),
+    ('i = "5 mA"  ', "# ± 5 mA, data sheet", "noise", "i"),
+    ('i = "5 mA"  ', "# of the machine: ± 0.1  # 2nd amplifier # since May", "noise", "i"),
+    ('i = "5 mA"  ', "# not significant: up to about 0.02 A, says Ann", "noise", "i"),
+    ('R_a = "6.5 ohm"     ', "# by a bridge; at 20 °C", "parameters", "R_a"),
+    ("R_a = '6 # ohm' ", "# by a bridge", "parameters", "R_a"),
 ]
 
 
-@pytest.mark.parametrize(("row", "table", "name"), COMMENTED)
-def test_what_a_person_wrote_behind_a_replaced_value_stays(row: str, table: str, name: str) -> None:
-    written = row.rpartition("# ")[2]
-    text = f"[{table}]\n{row}\n"
-    for interval in ("± 0.2", "± 0.1", "± 0.1"):  # commissioned again: the interval of the value before goes
-        text = with_keys(text, table, {name: NewLine("7 V", f"of the machine: {interval}")})
-    new = f'{name} = "7 V"  # of the machine: ± 0.1  # {written}'
-    assert text == f"[{table}]\n{new}\n"
-
-
+@pytest.mark.parametrize(("before", "comment", "table", "name"), COMMENTED)
 @pytest.mark.parametrize(
-    "row", ['i = { column = "I", delay = "1 ms" }  # terminal 7', 'i = { column = "I" }  # terminal 7']
+    "remarks",
+    [
+        ("of the machine: ± 0.2", "of the machine: ± 0.1", "of the machine: ± 0.1"),
+        ("not significant: up to about 0.02 A", "not significant: up to about 0.03 A", "± 2 %"),
+        ("load: 1 to 2 N*m in monday #1.csv", "load: 1 to 3 N*m in a  # b.csv", "± 0.1 Ω, from a\t#2\n# 3.csv"),
+    ],
+    ids=["interval", "none", "name of a log"],
 )
-def test_a_delay_has_its_interval_beside_what_a_person_wrote(row: str) -> None:
-    text = f"[signals]\n{row}\n"
+def test_of_remarks_the_last_one_stays_and_all_that_a_person_wrote(
+    before: str, comment: str, table: str, name: str, remarks: tuple[str, ...]
+) -> None:
+    """Commissioned again and again: a person may have written anything, also what looks like a remark."""
+    text, empty = f"[{table}]\n{before}{comment}\n", f"[{table}]\n"
+    for remark in remarks:
+        text = with_keys(text, table, {name: NewLine("7 V", remark)})
+        alone = with_keys(empty, table, {name: NewLine("7 V", remark)}).rstrip()
+        assert alone.startswith(f'{empty}{name} = "7 V"  # otolith commission: ')
+        assert text == f"{alone}  {comment}\n"
+    assert with_keys(text, table, {name: NewLine("8 V")}) == f'{empty}{name} = "8 V"  {comment}\n'
+
+
+@pytest.mark.parametrize("comment", ["# terminal 7", "# ± 2 ms, data sheet"])
+@pytest.mark.parametrize("row", ['i = { column = "I", delay = "1 ms" }', 'i = { column = "I" }'])
+def test_a_delay_has_its_interval_beside_what_a_person_wrote(row: str, comment: str) -> None:
+    text = f"[signals]\n{row}  {comment}\n"
     for interval in ("± 0.2 ms", "± 0.1 ms"):
         text = with_delay(text, "i", "9.7 ms", interval)
-    assert text == '[signals]\ni = { column = "I", delay = "9.7 ms" }  # ± 0.1 ms  # terminal 7\n'
+    new = 'i = { column = "I", delay = "9.7 ms" }  # otolith commission: ± 0.1 ms'
+    assert text == f"[signals]\n{new}  {comment}\n"
 
 
 @pytest.mark.parametrize("name", ["V_a", "i", "omega", "T_load"])

@@ -20,8 +20,8 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 
 HEADER = re.compile(r"\s*\[\[?([^\]]*)\]\]?\s*(?:#.*)?")
-FORMER = re.compile(r"(?:^#|:) ± ")  # In a remark that was written here: the interval of the value before
-BESIDE = "  # "  # Between a remark and what a person wrote behind the value
+OWN = "otolith commission: "  # Begin of each remark that is written here, by which it is known later
+FORMER = re.compile(rf"(?:^|\s+)# {OWN}.*?(?=\s+#|$)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class NewLine:
     """The value of a key as it is to stand in a file."""
 
     value: Any
-    remark: str = ""
+    remark: str = ""  # Why it is so; it is marked as written here
 
 
 class Unchangeable(ValueError):  # noqa: N818 - it is told as part of another error
@@ -160,20 +160,13 @@ def _line(name: str, line: NewLine, comment: str = "") -> str:
 
 
 def _remarked(row: str, remark: str) -> str:
-    """Return a row that ends with a remark; what a person wrote behind the value follows it."""
+    """Return a row with a remark in place of the one that an earlier value got here; what a person wrote follows it."""
     whole = row.rstrip()
-    if not remark:
-        return row
     at = _comment_at(whole)
     value, comment = (whole, "") if at is None else (whole[:at].rstrip(), whole[at:])
-    return f"{value}  {toml_comment(remark)}{_of_person(comment, remark)}{row[len(whole) :]}"
-
-
-def _of_person(comment: str, remark: str) -> str:
-    """Return a comment without the remark that an earlier value got here."""
-    first, sign, rest = comment.partition(BESIDE)
-    is_former = not first or FORMER.search(first) or first == toml_comment(remark)
-    return f"{sign}{rest}" if is_former else f"  {comment}"
+    one = re.sub(r"\s(?=#)", "_", " ".join(remark.split()))  # A "#" behind a space begins the comment of a person
+    parts = [value, *([toml_comment(f"{OWN}{one}")] if one else []), FORMER.sub("", comment).strip()]
+    return "  ".join(filter(None, parts)) + row[len(whole) :]
 
 
 def _comment_at(row: str) -> int | None:
