@@ -9,8 +9,8 @@ import pytest
 from scipy.linalg import expm
 
 from otolith.acquisition.window import Array, Window
-from otolith.commissioning.own_values import own_values
-from otolith.commissioning.value_search import OwnValue, OwnValues
+from otolith.commissioning.own_values import own_values, widened
+from otolith.commissioning.value_search import OwnValue, OwnValues, ValueSearch
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import shifted
 from otolith.machine import find_twin
@@ -18,6 +18,7 @@ from otolith.twin.definition import Definition, Role
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import Unbalance
+from tests.variants import often
 
 Cut = Callable[..., list[tuple[Window, float]]]
 TRUE = {"R_a": 2.1, "L_a": 0.12, "J": 4e-4, "K_e": 0.11, "K_t": 0.11, "D": 6e-4}  # the example has 6.5, 0.673, ...
@@ -51,7 +52,10 @@ def found(twin: Definition, windows: list[Window], loads: set[str]) -> OwnValues
     known = tuple((row.name, row.nominal) for row in twin.parameters if row.role is not Role.ESTIMATED)
     problem = Problem(twin, known, free, tuple(output.noise for output in twin.outputs))
     searched = [row for row in twin.parameters if row.part or row.role is Role.ESTIMATED]  # as commissioning does
-    return own_values(problem, windows, searched, loads, lambda _: None)
+    values = own_values(problem, windows, searched, loads, lambda _: None)
+    held = {item.name: item.value for item in values.values if item.sd is None}
+    assert held == {name: twin.parameter(name).nominal for name in held}  # which the machine file keeps
+    return values
 
 
 def by_name(values: OwnValues) -> dict[str, OwnValue]:
@@ -106,6 +110,16 @@ def test_what_the_data_do_not_show_stays_as_it_was(motor: MotorScenario, windows
     rows = by_name(found(find_twin("dc_motor"), cut, set()))
     assert (rows["J"].value, rows["J"].sd) == (find_twin("dc_motor").parameter("J").nominal, None)
     assert rows["J"].remark
+
+
+def test_a_search_that_begins_elsewhere_holds_parameters_at_the_example(motor: MotorScenario, windows: Cut) -> None:
+    """As the second one does, beside components: the machine file keeps the example's value, the others must fit it."""
+    steady = motor.model_copy(update={"set_points": motor.set_points[:1], "repeat_every": None})
+    cut, twin = [window for window, _ in windows(steady, 10)][4:], find_twin("dc_motor")
+    problem = Problem(twin, (), tuple(map(widened, twin.parameters)), tuple(output.noise for output in twin.outputs))
+    values = ValueSearch(problem, cut, frozenset(), lambda _: None, TRUE).run()
+    held = by_name(values)["J"]
+    assert (held.value, held.sd) == (twin.parameter("J").nominal, None)
 
 
 def test_a_machine_of_another_kind_is_not_described(motor: MotorScenario, windows: Cut) -> None:
@@ -172,6 +186,24 @@ def test_an_unbalance_in_the_record_does_not_bias_the_values(
         sd = rows[name].sd
         assert sd is not None
         assert abs(rows[name].value - own[name]) < min(4.0 * sd, 0.05 * own[name]), name
+
+
+@pytest.mark.parametrize("load", often([0.0], [0.0, 6e-3]))
+def test_a_load_without_dry_friction_is_found_to_have_none_beside_an_unbalance(
+    motor: MotorScenario, windows: Cut, load: float
+) -> None:
+    """Values are fitted twice; the second fit begins at those of the first, but its sizes are those of the example."""
+    shape = {"kind": "unbalance", "start": "0 s", "acceleration": "40 rad/s^2", "frequency": "10 rad/s"}
+    shaken = motor.model_copy(update={"load": load, "faults": (Unbalance.model_validate(shape),)})
+    twin = without_sensor(find_twin("dc_motor"), UnmeasuredInput("T_load", Assumption.FRICTION))
+    values = found(twin, [window for window, _ in windows(shaken, 8)], set())
+    rows = by_name(values)
+    assert values.beside == ("shaft/periodic/t",)
+    assert not values.faults
+    for name, truth in (("T_load_dry", 0.0), ("D", TRUE["D"] + load)):
+        sd = rows[name].sd
+        assert sd is not None
+        assert abs(rows[name].value - truth) < 4.0 * sd, name
 
 
 def test_values_that_depend_on_what_the_twin_lacks_are_not_taken(windows: Cut) -> None:

@@ -113,17 +113,21 @@ class _RecordSearch:
     progress: Progress
 
     def search(
-        self, windows: Sequence[Window], problem: Problem | None = None, free: Sequence[Parameter] = ()
+        self, windows: Sequence[Window], problem: Problem | None = None, start: Mapping[str, float] | None = None
     ) -> ValueSearch:
-        """Return a search of all free parameters, or of those of a ``problem`` with components."""
-        base, rows = problem or self.problem, free or self.free
+        """Return a search of all free parameters, and of those of the components of a ``problem``.
+
+        It begins at the values ``start``, else at those of the twin's example.
+        """
+        base, added = problem or self.problem, problem.free if problem else ()
+        rows = (*self.free, *(row for row in added if row.name.startswith("_")))
         names = {row.name for row in rows}
         known = [pair for pair in base.known if pair[0] not in names]
         known += [(row.name, row.nominal) for row in base.free if row.name not in names]
         wide = tuple(row if row.name.startswith("_") else widened(row) for row in rows)
         phases = {row.name for row in rows if row.name.startswith("_phase_")}
         searched = replace(base, known=tuple(known), free=wide, open_loop=False)
-        return ValueSearch(searched, windows, self.loads | phases, self.progress)
+        return ValueSearch(searched, windows, self.loads | phases, self.progress, start)
 
     def punctual(self, windows: Sequence[Window]) -> tuple[OwnValues, list[Window]]:
         """Return the values, and the windows without the delays that show beside them."""
@@ -179,10 +183,7 @@ class _RecordSearch:
     ) -> OwnValues:
         """Return the values beside components, whose amplitudes and inner parameters are the same in all windows."""
         wider = augment(there, [item.component for item in shown])
-        values = {item.name: item.value for item in best.values}
-        rows = [replace(row, nominal=values.get(row.name, row.nominal)) for row in self.free]
-        rows += [row for row in wider.free if row.name.startswith("_")]
-        found = self.search(windows, wider, rows).run()
+        found = self.search(windows, wider, {item.name: item.value for item in best.values}).run()
         own = tuple(item for item in found.values if not item.name.startswith("_"))
         loads = {name: ends for name, ends in found.loads.items() if not name.startswith("_")}
         return replace(found, values=own, loads=loads, beside=tuple(item.component.key for item in shown))

@@ -90,7 +90,16 @@ class _Fitted:
 class ValueSearch:
     """A search for the values that all windows have in common."""
 
-    def __init__(self, problem: Problem, windows: Sequence[Window], loads: frozenset[str], progress: Progress) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        windows: Sequence[Window],
+        loads: frozenset[str],
+        progress: Progress,
+        start: Mapping[str, float] | None = None,
+    ) -> None:
+        """The search begins at the values ``start``, else at those of ``problem``, at which parameters are held."""
+        self._start = start or {}
         self._problem, self._windows, self._loads, self._progress = problem, windows, loads, progress
         self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
         self._fixed: dict[str, str] = {}  # Not determined, and why
@@ -219,7 +228,7 @@ class ValueSearch:
         )
         places = {row.name: at for at, row in enumerate(problem.free)}
         moved = {name: [places[self._problem.free[at].name] for at in ats] for name, ats in shared.items()}
-        parameters = np.array([row.nominal for row in problem.free])
+        parameters = np.array([self._start.get(row.name, row.nominal) for row in problem.free])
         guesses: list[Array] = []
         noise, walk = self._levels()
         for share in STAGES:
