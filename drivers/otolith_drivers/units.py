@@ -299,6 +299,27 @@ def to_base(text: str) -> tuple[float, float]:
     return one - zero, zero
 
 
+def is_one_in_si(one: str, other: str) -> bool:
+    """Return whether units of two quantities are the same in SI, as V*s/rad and N*m/A are.
+
+    Two units of one quantity are not: neither a prefix nor an angle makes another one.
+    """
+    has_one_dimension = unit(one).dimensionality == unit(other).dimensionality
+    is_as_large = math.isclose(to_base(one)[0], to_base(other)[0], rel_tol=SAME)
+    return has_one_dimension and is_as_large and _dimensions(one) != _dimensions(other)
+
+
+def _dimensions(text: str) -> dict[str, float]:
+    """Return the exponents of the dimensions of the factors with which a unit is written."""
+    exponents = dict[str, float]()
+    for name, exponent in _registry().Quantity(1.0, unit(text)).unit_items():
+        part = _registry().Unit(name)
+        if not part.dimensionless:
+            dimension = str(part.dimensionality)
+            exponents[dimension] = exponents.get(dimension, 0.0) + float(str(exponent))
+    return exponents
+
+
 def _check_dimension(source: str, target: str) -> None:
     dimension = unit(target).dimensionality
     # pint treats angles as dimensionless, so 1 Hz would become 1 rad/s: wrong by 2π if turns are meant.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,10 @@ from scipy.linalg import expm
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.own_values import own_values, widened
-from otolith.commissioning.value_search import OwnValue, OwnValues, ValueSearch
+from otolith.commissioning.value_search import OwnValue, OwnValues, ValueSearch, are_one_constant
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import shifted
-from otolith.machine import find_twin
+from otolith.machine import find_twin, library_twins
 from otolith.twin.definition import Definition, Role
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -260,6 +261,32 @@ def test_a_measured_load_shows_the_torque_constant() -> None:
 def test_a_wrong_sign_is_named(name: str) -> None:
     values = found(find_twin("dc_motor"), changed(loaded(), name, np.negative), set())
     assert name in " ".join(values.faults)
+
+
+def test_only_constants_that_are_one_in_si_units_are_compared_over_the_library() -> None:
+    """K_e of a motor in V*s/rad is K_t in N*m/A. Frictions of two directions have one unit, and differ as they like."""
+    found = {
+        (name, one.name, other.name)
+        for name in library_twins()
+        for one, other in combinations(find_twin(name).parameters, 2)
+        if are_one_constant(one, other)
+    }
+    assert found == {("dc_motor", "K_e", "K_t"), ("dc_motor_coulomb", "K_e", "K_t")}
+
+
+@pytest.mark.parametrize(
+    ("unit", "share", "is_same"),
+    [
+        ("N*m/A", 1.0, True),
+        ("N*m/A", 2.0, False),
+        ("mN*m/A", 1.0, False),
+        ("V*s", 1.0, False),  # the same quantity
+        ("kg", 1.0, False),
+    ],
+)
+def test_a_constant_is_one_that_the_twin_states_in_other_quantities(unit: str, share: float, is_same: bool) -> None:
+    own = find_twin("dc_motor").parameter("K_e")
+    assert are_one_constant(own, replace(own, name="other", unit=unit, nominal=share * own.nominal)) is is_same
 
 
 def test_a_speed_in_rpm_that_is_said_to_be_in_radians_is_named() -> None:

@@ -6,8 +6,8 @@ by process noise as large as the signals move: then the residuals are nearly lin
 have less, until only what the signals show of it is left.
 
 What the data determine only in combination is not guessed: a parameter that the weakest direction moves most keeps its
-stated value, or is taken as equal to one that the twin's example has with the same value, bounds and dimension, as the
-two constants of a DC motor are. Then the others are fitted again.
+stated value, or is taken as equal to one that is the same constant in SI units, as the two constants of a DC motor are.
+Then the others are fitted again.
 
 A signal that is late biases the values. So delays of all signals are fitted with the values, and taken off the samples
 where that makes the record decisively more likely.
@@ -26,7 +26,7 @@ from otolith.acquisition.window import Window
 from otolith.commissioning.identification import identify_noise, sample_noise, usable_windows
 from otolith.commissioning.likelihood import Progress
 from otolith.commissioning.structure import Structure, remaining_structure
-from otolith.commissioning.value_search import OwnValues, ValueSearch, are_alike
+from otolith.commissioning.value_search import OwnValues, ValueSearch, are_one_constant
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.problem import Problem, augment
 from otolith.estimation.timing import delayable, shifted
@@ -94,7 +94,7 @@ def _mixed_units(free: Sequence[Parameter], found: OwnValues) -> Iterator[str]:
     )
     for at, one in enumerate(values):
         for other in values[at + 1 :]:
-            if not are_alike(rows[one.name], rows[other.name]) or not one.value or not other.value:
+            if not are_one_constant(rows[one.name], rows[other.name]) or not one.value or not other.value:
                 continue
             larger, smaller = sorted((one, other), key=lambda item: -abs(item.value))
             ratio = larger.value / smaller.value

@@ -16,7 +16,7 @@ from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay
 from otolith.twin.definition import Parameter
-from otolith_drivers.units import to_base
+from otolith_drivers.units import is_one_in_si
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would be a random walk
@@ -209,7 +209,7 @@ class ValueSearch:
             mine = parameters[self._places[name]]
             for other in (item for item in values if item not in weakest):
                 is_determined = QUANTILE * sd[other] <= DETERMINED * abs(values[other])
-                if is_determined and are_alike(mine, parameters[self._places[other]]):
+                if is_determined and are_one_constant(mine, parameters[self._places[other]]):
                     self._equal[name] = other
                     return
         first, *others = weakest
@@ -323,7 +323,11 @@ def _cost(result: FitResult) -> float:
     return float(np.sqrt(result.chi_square / max(len(result.residuals), 1)))
 
 
-def are_alike(one: Parameter, other: Parameter) -> bool:
-    """Whether the example of the twin has both with the same value, bounds and dimension."""
+def are_one_constant(one: Parameter, other: Parameter) -> bool:
+    """Whether a twin states one constant twice, as that of a motor by its voltage in V*s/rad and its torque in N*m/A.
+
+    Both have the same example and bounds, in units of other quantities that are the same in SI. Two of one unit are two
+    of a kind, as the frictions of two directions, and may differ.
+    """
     numbers = [(row.nominal, row.low, row.high) for row in (one, other)]
-    return numbers[0] == numbers[1] and to_base(one.unit) == to_base(other.unit)
+    return numbers[0] == numbers[1] and is_one_in_si(one.unit, other.unit)
