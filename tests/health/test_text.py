@@ -91,6 +91,16 @@ def test_a_line_does_not_repeat_what_the_line_before_has_said() -> None:
     assert summary(other, first).endswith("late, 1 as before")
 
 
+@pytest.mark.parametrize("level", Level)
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_lines_of_the_log_have_the_state_as_people_read_it(level: Level, language: Language) -> None:
+    health = HealthDocument(state=level, since=0.0, reason="", parts={}, language=language)
+    document = report(3).model_copy(update={"health": health})
+    word = {Level.NO_DATA: "UNKNOWN"}.get(level, level.value)
+    assert summary(document).startswith(f"{word}, window 3")
+    assert f" {word} window 3" in brief(document)
+
+
 EVENT = EventDocument(
     id="limit/R_a@54.0",
     part="winding",

@@ -327,9 +327,9 @@ def zone_of(document: ReportDocument) -> str | None:
 
 def brief(document: ReportDocument, when: Clock | None = None) -> str:
     """A report in one English line of at most :data:`LINE` characters: time, state, the parameters that have room."""
-    state = "" if document.health is None else f" {texts_in('en').translated(document.health.state)}"
     when = when or clock_in(zone_of(document))
-    line = f"{when(document.window.end)}{state} window {document.window.index} {document.window.quality.verdict}"
+    window = f"window {document.window.index} {document.window.quality.verdict}"
+    line = " ".join([when(document.window.end), *_state_words(document), window])
     values = [f"{name} {value_text(parameter)}" for name, parameter in document.parameters.items()]
     for index, text in enumerate(values):
         left = len(values) - index - 1
@@ -345,8 +345,7 @@ def summary(document: ReportDocument, before: ReportDocument | None = None) -> s
 
     What the line of the report ``before`` it has said is counted.
     """
-    parts: list[str] = [] if document.health is None else [document.health.state]
-    parts += [f"window {document.window.index} {document.window.quality.verdict}"]
+    parts = [*_state_words(document), f"window {document.window.index} {document.window.quality.verdict}"]
     said = {} if before is None else _notices(before)
     for name, parameter in document.parameters.items():
         known = None if before is None else before.parameters.get(name)
@@ -360,6 +359,11 @@ def summary(document: ReportDocument, before: ReportDocument | None = None) -> s
     more = len(document.driver.warnings) - 1 if document.driver is not None else 0
     parts += [f"and {more} more warnings"] if more > 0 and new else []
     return ", ".join(filter(None, parts))
+
+
+def _state_words(document: ReportDocument) -> list[str]:
+    """Return the state of the machine as people read it in English; empty if the report has none."""
+    return [] if document.health is None else [texts_in("en").translated(document.health.state)]
 
 
 def _notices(document: ReportDocument) -> dict[str, str]:
