@@ -89,6 +89,19 @@ def test_what_others_may_not_read_stays_so(file: Path, tmp_path: Path) -> None:
     assert [path.stat().st_mode & 0o777 for path in (copies[0], kept)] == [0o640, 0o640]
 
 
+def test_what_others_may_no_longer_read_is_not_kept_for_them_either(file: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    installed(file, root)
+    copy = root / "etc/otolith" / file.name
+    before = copy.read_bytes()
+    file.write_text(file.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    file.chmod(0o600)
+    installed(file, root)
+    kept = copy.with_name(f"{file.name}~")
+    assert kept.read_bytes() == before
+    assert [path.stat().st_mode & 0o777 for path in (copy, kept)] == [0o640, 0o640]
+
+
 def test_the_service_may_enter_the_folders_that_are_there(file: Path, tmp_path: Path) -> None:
     """An administrator, or root with another umask, has made them for himself alone; other users stay outside."""
     root = tmp_path / "root"

@@ -2,8 +2,9 @@
 
 import errno
 import json
+import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from datetime import timedelta
 from pathlib import Path
@@ -25,7 +26,7 @@ from otolith.publishing.certificates import (
 )
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access, Credentials
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.cli.commands import otolith
 from tests.conftest import free_port
 from tests.messages import assert_each_says, assert_says, raises_saying
@@ -163,6 +164,70 @@ def test_a_renewal_that_fails_leaves_the_files_as_they_were(
     with raises_saying(ConfigurationError, str(site), "input/output error"):
         renew_certificate(site, "press", [], utc_now())
     assert {path: path.read_bytes() for path in site.iterdir()} == before
+
+
+@pytest.fixture
+def changed_modes(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Modes that files had before they got another one, on a disk on which a file has one name only."""
+
+    def no_link(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    def recorded(real: Callable[..., None]) -> Callable[..., None]:
+        def change(file: int | Path, mode: int, **rest: object) -> None:
+            before.append((os.fstat(file) if isinstance(file, int) else Path(file).stat()).st_mode)
+            real(file, mode, **rest)
+
+        return change
+
+    before = list[int]()
+    monkeypatch.setattr(os, "link", no_link)
+    for name in ("chmod", "fchmod"):
+        monkeypatch.setattr(os, name, recorded(getattr(os, name)))
+    umask = os.umask(0)
+    yield before
+    os.umask(umask)
+
+
+def test_nobody_else_may_read_the_copy_of_a_key_at_any_moment(site: Path, changed_modes: list[int]) -> None:
+    old = (site / "press.key").read_bytes()
+    renewal = renew_certificate(site, "press", [], utc_now())
+    kept = renewal.kept.with_suffix(".key")
+    assert kept.read_bytes() == old
+    assert (kept.stat().st_mode & 0o777, renewal.kept.stat().st_mode & 0o777) == (0o600, 0o644)
+    assert not any(mode & 0o077 for mode in changed_modes)
+
+
+@pytest.mark.parametrize("copied", [0, 1])
+def test_a_copy_that_fails_leaves_the_files_as_they_were(
+    site: Path, copied: int, changed_modes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, place, sync = {path: path.read_bytes() for path in site.iterdir()}, len(changed_modes), os.fsync
+
+    def full(handle: int) -> None:
+        if len(changed_modes) > place + copied:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with raises_saying(ServiceError, "press.until-", "No space left"):
+        renew_certificate(site, "press", [], utc_now())
+    assert {path: path.read_bytes() for path in site.iterdir()} == before
+
+
+def test_files_of_a_renewal_that_was_ended_are_no_certificate(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = certificates.issued(site)
+    with monkeypatch.context() as patch:
+        patch.setattr(certificates, "_keep", killed)
+        with pytest.raises(KeyboardInterrupt):
+            renew_certificate(site, "press", [], utc_now())
+    assert len(list(site.glob(".press*"))) == 2
+    assert certificates.issued(site) == before
+    renew_certificate(site, "press", [], utc_now())
+    assert not list(site.glob(".press*"))
 
 
 def test_a_file_that_is_no_certificate_hides_no_other(site: Path) -> None:

@@ -1,7 +1,7 @@
 """Certificates: the checks of those that a session uses, and the small certificate authority of ``otolith keys``."""
 
 import os
-import shutil
+import stat
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -15,9 +15,10 @@ from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from otolith.machine_file import address_of
+from otolith.storage.disk import replace_file
 from otolith_drivers.common.credentials import SECRET_LIMIT, secret
 from otolith_drivers.config_files import content
-from otolith_drivers.errors import ConfigurationError, NotValidNowError
+from otolith_drivers.errors import ConfigurationError, NotValidNowError, OtolithError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' makes
@@ -167,6 +168,7 @@ def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: dateti
 
     Raises:
         ConfigurationError: there is no certificate or authority, or the folder cannot be written.
+        ServiceError: the old files cannot be copied.
     """
     (old,) = authorities(folder / f"{name}.crt", ())[:1]
     end = old.not_valid_after_utc
@@ -183,13 +185,13 @@ def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: dateti
             _keep(path, kept)
         for path, _ in pairs:  # a daemon that reads them meanwhile misses neither
             fresh.with_name(f"{fresh.name}{path.suffix}").replace(path)
-    except (OSError, ConfigurationError) as error:
+    except (OSError, OtolithError) as error:
         for path, kept in pairs:
             if kept.exists():
                 kept.replace(path)  # nothing, if both are names of one file
                 kept.unlink(missing_ok=True)
         _remove(fresh)
-        if isinstance(error, ConfigurationError):
+        if isinstance(error, OtolithError):
             raise
         raise ConfigurationError(f"{folder}: cannot be written: {error.strerror}") from error
     return Renewal(stem.with_name(f"{stem.name}.crt"), end, certificate.not_valid_after_utc)
@@ -198,10 +200,11 @@ def renew_certificate(folder: Path, name: str, hosts: Sequence[str], now: dateti
 def issued(folder: Path) -> tuple[dict[Path, tuple[datetime, tuple[str, ...]]], dict[Path, str]]:
     """Return end and hosts of each certificate in ``folder``, by its path, and why other files of that kind are none.
 
-    The authority is the first.
+    The authority is the first. A renewal that was ended leaves hidden files, which are none.
     """
     rows, faults = dict[Path, tuple[datetime, tuple[str, ...]]](), dict[Path, str]()
-    for path in sorted(folder.glob("*.crt"), key=lambda path: (path.stem != "ca", path.name)):
+    paths = (path for path in folder.glob("*.crt") if not path.name.startswith("."))
+    for path in sorted(paths, key=lambda path: (path.stem != "ca", path.name)):
         try:
             own = authorities(path, ())[0]
             rows[path] = own.not_valid_after_utc, tuple(sorted(_names(own)))
@@ -266,13 +269,17 @@ def _remove(stem: Path) -> None:
 
 
 def _keep(path: Path, kept: Path) -> None:
-    """Give the file a second name; a copy where a file has one name only. A missing file is none to keep."""
+    """Give the file a second name; a copy where a file has one name only. A missing file is none to keep.
+
+    Nobody else may read the copy of a key at any moment, and half of a copy would replace its original later.
+    """
     try:
         os.link(path, kept)
     except FileNotFoundError:
         return
     except OSError:
-        shutil.copy2(path, kept)
+        status, copy = path.stat(), kept.parent.resolve() / kept.name
+        replace_file(copy, path.read_bytes(), f".{kept.name}.new", stat.S_IMODE(status.st_mode), status)
 
 
 def _write(

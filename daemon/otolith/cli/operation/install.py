@@ -8,7 +8,6 @@ import os
 import pwd
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -218,9 +217,10 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
         path.parent.mkdir(parents=True, exist_ok=True)
     finally:
         os.umask(umask)
-    if before is not None:
-        shutil.copy2(path, path.with_name(f"{path.name}~"))
     target, mode = path.parent.resolve() / path.name, 0o640 if item.is_private else 0o644
+    if before is not None:
+        status, kept = path.stat(), f"{path.name}~"
+        replace_file(target.with_name(kept), before, f".{kept}.new", status.st_mode & mode, status)
     replace_file(target, item.content, f".{path.name}.new", mode)
     return before is not None
 
