@@ -25,7 +25,7 @@ from otolith.acquisition.window import Array
 
 # Thresholds: docs/reference/thresholds-estimation.md has the origin of each.
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
-LEVEL_ERROR = 1.25  # factor by which the noise may be larger than stated
+LEVEL_ERROR = 1.235  # factor by which the noise may be larger than stated
 CHANCE = 1e-9  # probability of what noise alone does not do
 EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
 ROUNDING = 1e-12  # share of a limit up to which it is computed
