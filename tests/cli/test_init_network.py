@@ -139,6 +139,41 @@ def test_a_register_may_hold_another_usual_unit_than_the_display_shows(held: flo
     assert (found.signals["omega"], found.units["12"], found.scales["12"]) == ("12", unit, scale)
 
 
+@pytest.mark.parametrize(
+    ("held", "unit", "scale", "other"),
+    [
+        (1500.0, "rpm", "1", "rad/s"),  # the drive has sped up by 3.4 % since, or holds 150 rad/s: 1.2 % less
+        (1518.0, "rad/s", "0.1", "rpm"),  # exact, but a drive may also speed up by 4.7 %
+        (1450.0, "rpm", "1", None),
+        (2417.0, "turn/s", "0.01", None),
+    ],
+)
+def test_both_units_are_named_where_both_fit(
+    held: float, unit: str, scale: str, other: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    offers = [Offer(name, None, {}, np.full(3, value)) for name, value in (("10", 241.0), ("11", 2310.0), ("12", held))]
+    shown = Answers(displays={"V_a": "24.1 V", "i": "2.31 A", "omega": "1450 rpm"})
+    found = with_displays(shown, offers, [find_twin("dc_motor")])
+    assert (found.units["12"], found.scales["12"]) == (unit, scale)
+    remarks = [line for line in capsys.readouterr().out.splitlines() if "--unit" in line]
+    assert len(remarks) == (other is not None)
+    for remark in remarks:
+        assert_says(remark, "omega", f"--unit 12={other}", "--scale 12=")
+
+
+@pytest.mark.parametrize("held", [1450.0, 1500.0, 1518.0])
+def test_a_unit_that_was_told_gives_the_scale(held: float, capsys: pytest.CaptureFixture[str]) -> None:
+    """1450 rpm are 151.8 rad/s."""
+    offers = [Offer(name, None, {}, np.full(3, value)) for name, value in (("10", 241.0), ("11", 2310.0), ("12", held))]
+    displays = {"V_a": "24.1 V", "i": "2.31 A", "omega": "1450 rpm"}
+    found = with_displays(Answers(displays=displays, units={"12": "rad/s"}), offers, [find_twin("dc_motor")])
+    assert (found.signals["omega"], found.units["12"], found.scales["12"]) == ("12", "rad/s", "0.1")
+    assert "!" not in capsys.readouterr().out
+    for wrong in ("turn/s", "A"):
+        with raises_saying(ConfigurationError, "omega=1450 rpm"):
+            with_displays(Answers(displays=displays, units={"12": wrong}), offers, [find_twin("dc_motor")])
+
+
 def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     browsed = []
 

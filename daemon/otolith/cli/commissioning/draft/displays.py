@@ -1,30 +1,31 @@
 """Which register is which signal, and what a step of it is worth, from what the display of a drive shows meanwhile.
 
 Registers have neither names nor units. Drives scale them by powers of ten, so that a number off the display, times one
-of these, is what the register holds. Some hold another usual unit than the display shows, as rad/s where that has rpm:
-these are tried for a value that no register holds in its own unit, or not as closely: 0.1 rad/s is nearly 1 rpm.
+of these, is what the register holds. Some hold another usual unit than the display shows, as rad/s where that has rpm.
+0.1 rad/s is nearly 1 rpm, and a display is read earlier than a register. So a value that is close as displayed is taken
+so, unless it is exact in another unit only; where both are close, both are named.
 """
 
 import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from otolith.acquisition.window import Array
 from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.offers import Offer
 from otolith.cli.terminal import echo
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.units import factor
+from otolith_drivers.units import are_equal, factor
 
 # Engineering choices: docs/reference/thresholds-cli.md.
 POWERS = range(-5, 4)  # of ten, by which a drive scales a register
 CLOSE = 0.05  # of the displayed value: how far a register may be from it
-AS_CLOSE = 0.01  # of the displayed value: registers that differ by less are both named
+AS_CLOSE = 0.01  # of the displayed value: less is exact; registers and units that differ by less are both named
 USUAL = (  # units of one quantity between which displays and registers differ by no power of ten
     ("rpm", "rad/s", "turn/s"),
     ("degree", "rad", "turn"),
@@ -49,61 +50,90 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
     twin = _twin_of(answers, twins)
     shown = {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
     names = [name for name in shown if name not in answers.signals]
-    distances, pairs = _assigned([shown[name][0] for name in names], offers)
-    found = {names[at] for at, place in pairs if distances[at, place] <= CLOSE}
-    taken = {place for at, place in pairs if names[at] in found}
-    rest = [offer for at, offer in enumerate(offers) if at not in taken]
-    shown |= {name: _in_usual_unit(shown[name], rest) for name in names if name not in found}
-    close = {names[at]: offers[place] for at, place in pairs if names[at] in found}
-    shown |= {name: _in_usual_unit(shown[name], [offer]) for name, offer in close.items()}
-    signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
-    distances, pairs = _assigned([shown[name][0] for name in names], offers)
-    found = {names[at] for at, place in pairs if distances[at, place] <= CLOSE}
+    readings = [[_readings(shown[name], offer, answers.units.get(offer.name)) for offer in offers] for name in names]
+    pairs = _assigned(readings)
+    found = {names[at] for at, place in pairs if _chosen(readings[at][place]).distance <= CLOSE}
     if lost := [f"{name}={answers.displays[name]}" for name in names if name not in found]:
         raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(offers)}")
+    signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
     for at, place in pairs:
-        name, offer = names[at], offers[int(place)]
-        value, unit = shown[name]
-        power = _power(value, offer)
-        signals[name], units[offer.name] = offer.name, units.get(offer.name, unit)
+        name, offer, reading = names[at], offers[place], _chosen(readings[at][place])
+        power = _power(reading.value, offer)
+        signals[name] = offer.name
+        units.setdefault(offer.name, reading.unit)
         scales.setdefault(offer.name, f"{10.0**power:g}")
-        echo(f"{name}: {value:g} {unit} is {float(np.median(offer.values)):.5g}·10^{power} in register {offer.name}")
-        equal = distances[at] <= distances[at, place] + AS_CLOSE
-        if others := [row.name for row, is_equal in zip(offers, equal, strict=True) if is_equal and row is not offer]:
+        held = f"{float(np.median(offer.values)):.5g}·10^{power} in register {offer.name}"
+        echo(f"{name}: {reading.value:g} {reading.unit} is {held}")
+        distances = [_distance(reading.value, row) for row in offers]
+        equal = [row.name for row, far in zip(offers, distances, strict=True) if far <= reading.distance + AS_CLOSE]
+        if others := [other for other in equal if other != offer.name]:
             remedy = f"another speed or load decides, or --signal {name}=REGISTER"
             echo(f"! {', '.join(others)} would fit {name} as well: {remedy}")
+        for other in _rivals(readings[at][place]):
+            own = f"--unit {offer.name}={other.unit} --scale {offer.name}={10.0 ** _power(other.value, offer):g}"
+            remedy = f"read the display again while the machine runs steadily, or {own}"
+            echo(f"! {other.unit} would fit {name} in register {offer.name} as well: {remedy}")
     return replace(answers, twin=twin.name, signals=signals, units=units, scales=scales)
 
 
-def _assigned(values: Sequence[float], offers: Sequence[Offer]) -> tuple[Array, list[tuple[int, int]]]:
-    """Return the distance of each value from each register, and which register is best for which value."""
-    distances = np.array([[_distance(value, offer) for offer in offers] for value in values])
-    distances = distances.reshape(len(values), len(offers))
-    return distances, list(zip(*map(np.ndarray.tolist, linear_sum_assignment(distances)), strict=True))
+class _Reading(NamedTuple):
+    """A displayed value in a unit in which a register may hold it."""
+
+    value: float
+    unit: str
+    distance: float  # From what the register holds, in shares of it
 
 
-def _in_usual_unit(shown: tuple[float, str], offers: Sequence[Offer]) -> tuple[float, str]:
-    """Return a displayed value in the usual unit in which a register holds it; else as it is."""
-
-    def distance(number: float) -> float:
-        return min((_distance(number, offer) for offer in offers), default=UNLIKELY)
-
+def _readings(shown: tuple[float, str], offer: Offer, told: str | None) -> list[_Reading]:
+    """Return a displayed value in the unit that was ``told`` of a register; else as it is, then in usual units."""
     value, unit = shown
-    converted = [shown]
-    for other in (other for units in USUAL for other in units if _is_one_of(unit, units)):
-        scale, offset = factor(unit, other)
-        converted.append((scale * value + offset, other))
-    closest = min(converted, key=lambda each: distance(each[0]))
-    return closest if distance(closest[0]) <= min(CLOSE, distance(value) - AS_CLOSE) else shown
-
-
-def _is_one_of(unit: str, units: Sequence[str]) -> bool:
-    """Whether a unit is one of the ``units``, however it is written."""
+    units = [unit, *_other_units(unit)] if told is None else [told]
+    converted = list[_Reading]()
     for other in units:
         with contextlib.suppress(ValueError):
-            if factor(unit, other) == (1.0, 0.0):
-                return True
-    return False
+            scale, offset = (1.0, 0.0) if other == unit else factor(unit, other)
+            number = scale * value + offset
+            converted.append(_Reading(number, other, _distance(number, offer)))
+    return converted or [_Reading(value, unit, UNLIKELY)]
+
+
+def _chosen(readings: Sequence[_Reading]) -> _Reading:
+    """Return the first reading if it is close and no other one is exact alone; else the closest."""
+    first, closest = readings[0], min(readings, key=lambda each: each.distance)
+    is_exact_alone = closest.distance <= min(AS_CLOSE, first.distance - AS_CLOSE)
+    return first if first.distance <= CLOSE and not is_exact_alone else closest
+
+
+def _rivals(readings: Sequence[_Reading]) -> list[_Reading]:
+    """Return the readings that may be right in place of the chosen one."""
+    chosen = _chosen(readings)
+    limits = [CLOSE, *[min(CLOSE, chosen.distance + AS_CLOSE) for _ in readings[1:]]]
+    return [each for each, limit in zip(readings, limits, strict=True) if each != chosen and each.distance <= limit]
+
+
+def _assigned(readings: Sequence[Sequence[Sequence[_Reading]]]) -> list[tuple[int, int]]:
+    """Return which register is best for which value."""
+    costs = np.array([[_cost(each) for each in registers] for registers in readings])
+    costs = costs.reshape(len(readings), len(readings[0]) if readings else 0)
+    return list(zip(*map(np.ndarray.tolist, linear_sum_assignment(costs)), strict=True))
+
+
+def _cost(readings: Sequence[_Reading]) -> float:
+    """Return the distance; one that is close as displayed is better than in another unit, and all others are alike."""
+    distance = _chosen(readings).distance
+    if distance > CLOSE:
+        return UNLIKELY
+    return distance if readings[0].distance <= CLOSE else distance + CLOSE
+
+
+def _other_units(unit: str) -> list[str]:
+    """Return the other units that are usual for a quantity in ``unit``."""
+    for units in USUAL:
+        with contextlib.suppress(ValueError):
+            same = [other for other in units if are_equal(unit, other, other)]
+            if same:
+                return [other for other in units if other not in same]
+    return []
 
 
 def _not_found(offers: Sequence[Offer]) -> str:
