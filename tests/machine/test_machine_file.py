@@ -124,7 +124,7 @@ def limits_of(own_machine: OwnMachine, row: str, extra: str = "") -> MonitoringP
 @pytest.mark.parametrize(
     ("row", "expected"),
     [
-        ('watch = "-3 %", act = "-8 %"', [(Level.WATCH, 6.305, True), (Level.ACT, 5.98, True)]),
+        ('value = "6.5 ohm", watch = "-3 %", act = "-8 %"', [(Level.WATCH, 6.305, True), (Level.ACT, 5.98, True)]),
         ('value = "10 ohm", act = "+10 %"', [(Level.ACT, 11.0, False)]),
         ('watch = ["5.9 ohm", "7000 mohm"]', [(Level.WATCH, 5.9, True), (Level.WATCH, 7.0, False)]),
         ("watch = []", []),
