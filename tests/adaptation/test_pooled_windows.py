@@ -5,6 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.changes.machines import SERVO_AXIS, SERVO_AXIS_DIRECTIONAL
+from benchmarks.changes.observe import Case, recordings
+from benchmarks.changes.plants import HEALTHY
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
@@ -67,6 +70,20 @@ def test_a_healthy_axis_whose_load_wanders_adopts_nothing(seed: int, stated: flo
     assert not any(document.components for document in documents)
 
 
+@pytest.mark.parametrize(
+    ("axis", "number", "windows"),
+    often_rows(
+        [("directional", 0, 6)], [("directional", 0, 6), ("directional", 4, 18), ("any", 4, 11), ("any", 17, 10)]
+    ),
+)
+def test_healthy_axes_adopt_nothing(axis: str, number: int, windows: int) -> None:
+    """Of some hundred frequencies, one agrees by chance in two searches in a row, which share all windows but one."""
+    plant = SERVO_AXIS_DIRECTIONAL if axis == "by way" else SERVO_AXIS
+    case = Case("noise alone", plant, HEALTHY, healthy=windows, changed=0)
+    (of_run,) = recordings(case, case.problem, [number], 1)
+    assert not any(document.components for document in run(case.problem, of_run)[1])
+
+
 @pytest.mark.parametrize("seed", [2, pytest.param(1, marks=pytest.mark.full)])
 def test_an_error_of_the_encoder_is_no_force(seed: int) -> None:
     """It depends on the position as well."""
@@ -107,7 +124,8 @@ def test_two_searches_must_find_the_same(monkeypatch: pytest.MonkeyPatch, second
     fits = fitted()
     component = Component("carriage", "periodic", "x", AMPLITUDE, 2.0 * np.pi / PITCH)
     structures = [
-        Structure(replace(component, inner=factor * component.inner), 0.1, 1.0, 50.0, False) for factor in (1.0, second)
+        Structure(replace(component, inner=factor * component.inner), 0.1, 1.0, 50.0, False, chance=1e-7)
+        for factor in (1.0, second)
     ]
     monkeypatch.setattr(module, "lacking_component", lambda *_: structures.pop(0))
     pooled = PooledWindows()

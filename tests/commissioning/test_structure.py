@@ -112,7 +112,7 @@ def test_amplitudes_of_noise_agree_as_often_as_stated(
     information = roots.transpose(0, 2, 1) @ roots
     noise = random.standard_normal((10_000, count, phases))
     amplitudes = np.linalg.solve(roots[None], noise[..., None])[..., 0]
-    agreeing = sum(module._amplitude_sd(values, information) is not None for values in amplitudes)
+    agreeing = sum(module._amplitude_sd(values, information)[1] < module.SIGNIFICANCE for values in amplitudes)
     assert 0.015 < agreeing / len(amplitudes) < 0.025
 
 
@@ -121,23 +121,23 @@ def test_four_windows_agree_on_a_clear_sine() -> None:
     random, agreeing = np.random.default_rng(1), 0
     for _ in range(100):
         values = np.array([8.0, -6.0]) + random.standard_normal((4, 2))
-        agreeing += module._amplitude_sd(values, np.tile(np.eye(2), (4, 1, 1))) is not None
+        agreeing += module._amplitude_sd(values, np.tile(np.eye(2), (4, 1, 1)))[1] < module.SIGNIFICANCE
     assert agreeing >= 90
 
 
 def test_one_window_alone_shows_no_agreement() -> None:
     values, information = np.full((8, 1), 10.0), np.ones((8, 1, 1))
-    assert module._amplitude_sd(values, information) is not None
+    assert module._amplitude_sd(values, information)[1] < module.SIGNIFICANCE
     information[0] = 1e3
-    assert module._amplitude_sd(values, information) is None
+    assert module._amplitude_sd(values, information)[1] >= module.SIGNIFICANCE
 
 
 def test_the_sd_of_an_amplitude_is_that_of_a_mean() -> None:
     values, known = np.random.default_rng(1).normal(10.0, 0.1, (8, 1)), np.ones((8, 1, 1))
-    assert module._amplitude_sd(values, known) == pytest.approx(values.std(ddof=1) / np.sqrt(8.0))
+    assert module._amplitude_sd(values, known)[0] == pytest.approx(values.std(ddof=1) / np.sqrt(8.0))
     parts = np.random.default_rng(1).normal((30.0, 40.0), 0.1, (8, 2))
     both = np.sqrt((parts.var(axis=0, ddof=1).mean()) / 8.0)
-    assert module._amplitude_sd(parts, np.tile(np.eye(2), (8, 1, 1))) == pytest.approx(both)
+    assert module._amplitude_sd(parts, np.tile(np.eye(2), (8, 1, 1)))[0] == pytest.approx(both)
 
 
 def test_a_slow_sine_of_the_position_does_not_stand_out() -> None:

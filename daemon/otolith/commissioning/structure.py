@@ -44,6 +44,7 @@ from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
+CONFIRMED = 1e-6  # the same of what is adopted
 CHANCE_DEVIATE = 3.0  # standard deviations that count as chance: of χ² of further phases, of a parameter's value
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
@@ -74,6 +75,7 @@ class Structure:
     """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
     phase_sd: float = UNKNOWN_PHASE_SD
     """Standard deviation of its phase, where its source is zero."""
+    chance: float = 1.0  # Probability that amplitudes of noise agree as those of the windows do
     is_at_bound: bool = False
     """Whether its inner parameter lies at a bound of the search: then no form that is searched has its shape."""
 
@@ -339,8 +341,8 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     """Return the structure of a guess, which is then projected out, or None if the windows do not agree on it."""
     form, inner = guess.form, guess.inner
     is_restarted, periodic = pooled.is_restarted(form), len(form.model.phases) > 1
-    sd = _amplitude_sd(*pooled.amplitudes_of_windows((form, inner)))
-    if sd is None or (is_restarted and not pooled.stands_out((form, inner))):
+    sd, chance = _amplitude_sd(*pooled.amplitudes_of_windows((form, inner)))
+    if chance >= SIGNIFICANCE or (is_restarted and not pooled.stands_out((form, inner))):
         return None
     pooled.add_component(pooled.columns(guess))
     first, second = map(float, guess.amplitudes)
@@ -360,33 +362,34 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     centre = float(np.abs(pooled.x[form.source].mean()))
     phase_sd = UNKNOWN_PHASE_SD if is_restarted else float(np.hypot(sd / component.amplitude, inner_sd * centre))
     at_bound = not periodic and form.model.inner is not None and _is_at_bound(inner, form.bounds)
-    return Structure(component, sd, float(inner_sd), guess.score, is_restarted, phase_sd, at_bound), form
+    return Structure(component, sd, float(inner_sd), guess.score, is_restarted, phase_sd, chance, at_bound), form
 
 
-def _amplitude_sd(values: Array, information: Array) -> float | None:
-    """Return the standard deviation of the weighted mean of amplitudes (windows, phases), from their scatter.
+def _amplitude_sd(values: Array, information: Array) -> tuple[float, float]:
+    """Return the standard deviation of the weighted mean of amplitudes (windows, phases), and its chance.
 
-    None if the mean is not significant: the windows do not agree on an amplitude. The covariance of each is inverse to
-    its ``information`` (windows, phases, phases), times a common factor. The ratio of what the mean explains to the
-    scatter has an F distribution, for one amplitude the square of Student's t. Both parts of a sine count, since noise
-    of any phase has a positive mean in the phase of all windows together (J. D. Victor, J. Mast,
-    Electroencephalography and Clinical Neurophysiology 78, 1991).
+    The one is from their scatter, the other the probability that noise agrees as much on an amplitude. The covariance
+    of each is inverse to its ``information`` (windows, phases, phases), times a common factor. The ratio of what the
+    mean explains to the scatter has an F distribution, for one amplitude the square of Student's t. Both parts of a
+    sine count, since noise of any phase has a positive mean in the phase of all windows together (J. D. Victor,
+    J. Mast, Electroencephalography and Clinical Neurophysiology 78, 1991).
     """
     from scipy.special import fdtrc  # noqa: PLC0415 - only a component that would be significant needs SciPy
 
     windows, phases = values.shape
     weights = np.trace(information, axis1=1, axis2=2)
     if not values.any() or (weights**2).sum() >= MAX_CONCENTRATION * weights.sum() ** 2:
-        return None
+        return np.inf, 1.0
     inverse = np.linalg.pinv(information.sum(axis=0), hermitian=True)
     mean = inverse @ np.einsum("wpq,wq->p", information, values)
     explained = float(mean @ information.sum(axis=0) @ mean)
     left, degrees = values - mean, phases * (windows - 1.0)
     variance = float(np.einsum("wp,wpq,wq->", left, information, left)) / degrees
     variance = max(variance, ROUNDING**2 * explained)
-    if not explained or fdtrc(phases, degrees, explained / phases / variance) >= SIGNIFICANCE:
-        return None
-    return float(np.sqrt(variance * (mean @ inverse @ mean) / (mean @ mean)))
+    if not explained:
+        return np.inf, 1.0
+    chance = float(fdtrc(phases, degrees, explained / phases / variance))
+    return float(np.sqrt(variance * (mean @ inverse @ mean) / (mean @ mean))), chance
 
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:
@@ -406,7 +409,8 @@ class PooledWindows:
     def after(self, fitted: Fit, parameters: Array) -> "PooledWindows":
         """Return the windows with that of a fit; ``parameters`` (free,) are known after it.
 
-        What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
+        What two searches in a row show is confirmed if none of the inner parameters that were tried would agree as much
+        by chance: the second search has a window that the first one has not seen, but its other windows as well.
         """
         pause, problem = self.pause - 1, fitted.problem
         if not positions(problem.base_model):
@@ -424,7 +428,7 @@ class PooledWindows:
         shown, before = lacking_component(problem, windows), self.shown
         if shown is not None and before is not None and shown.component.key == before.component.key:
             one, other = shown.component.inner, before.component.inner
-            if abs(one - other) <= SAME_INNER * abs(one):
+            if abs(one - other) <= SAME_INNER * abs(one) and shown.chance < CONFIRMED:
                 return PooledWindows(confirmed=shown)
         longer = min(2 * self.next_pause, MAX_PAUSE)
         return PooledWindows(windows, self.next_pause if shown is None else 1, longer, shown)
