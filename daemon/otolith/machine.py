@@ -346,7 +346,7 @@ def _plan(
         for name, row in free.items()
     }
     own = _own_values(file, twin, complete)
-    parameters = _waiting(parameters, own)
+    parameters = _with_waiting_limits(parameters, own)
     for name, quantity in parameters.items():
         table = file.parameters.get(name, ParameterTable())
         parameters[name] = _with_temperature(quantity, free[name], table, twin, context)
@@ -358,7 +358,7 @@ def _plan(
         for name, row in amplitudes.items()
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
-    known = _waiting(known, own)
+    known = _with_waiting_limits(known, own)
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)
@@ -385,10 +385,12 @@ def stands_for_load(name: str, twin: Definition, complete: Definition) -> bool:
     return own is not None and twin.parameter(name) != own
 
 
-def _waiting(quantities: Mapping[str, MonitoredQuantity], judged: Collection[str]) -> dict[str, MonitoredQuantity]:
-    """Return the quantities; those that are not ``judged`` have an example's value, whose percentages wait."""
+def _with_waiting_limits(
+    quantities: Mapping[str, MonitoredQuantity], own: Collection[str]
+) -> dict[str, MonitoredQuantity]:
+    """Return the quantities; the value of those that are not ``own`` is an example's, whose percentages wait."""
     found = dict(quantities)
-    for name in quantities.keys() - judged:
+    for name in quantities.keys() - own:
         limits, quantity = {True: list[Limit](), False: list[Limit]()}, quantities[name]
         for limit in quantity.limits:
             limits[limit.is_relative].append(limit)

@@ -72,7 +72,9 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
-    document = report.document.model_copy(update={"window": window_document(whole)})  # reports come as often as windows
+    document = report.document
+    if shortened:  # reports come as often as whole windows
+        document = document.model_copy(update={"window": window_document(whole)})
     health, document = assess(state.plan, state.health, document)
     return _next_state(state, result, previous, health), replace(report, document=document)
 

@@ -78,8 +78,8 @@ def own_values(
 def _at_rest(twin: Definition, windows: Sequence[Window]) -> Iterator[str]:
     """Yield the outputs without which, or without a change of which, the data show no value."""
     for output in twin.outputs:
-        found = [window.column(output.name)[~window.missing_in(output.name)] for window in windows]
-        values = np.concatenate(found) if found else np.zeros(0)
+        measured = [window.column(output.name)[~window.missing_in(output.name)] for window in windows]
+        values = np.concatenate(measured) if measured else np.zeros(0)
         if windows and not len(values):
             yield f"{output.name} has no value in any window"
         elif len(values) and np.ptp(values) == 0.0:
@@ -143,10 +143,10 @@ class _RecordSearch:
             given = dict(zip(delayable(twin), late.tolist(), strict=True))
             moved = sorted((shifted(twin, window, given) for window in windows), key=lambda window: window.start)
             search = self.search(moved)
-            found = search.run()
-            if search.gain(best.cost, found.cost) <= DECISIVE:
+            without_delays = search.run()
+            if search.gain(best.cost, without_delays.cost) <= DECISIVE:
                 break
-            best, best_windows = found, moved
+            best, best_windows = without_delays, moved
         return best, best_windows
 
     def reversed_signals(self, best: OwnValues, windows: Sequence[Window]) -> Iterator[str]:
@@ -170,10 +170,10 @@ class _RecordSearch:
         noise = identify_noise(there, windows, self.progress)
         shown = [item for item in remaining_structure(there, noise, windows, self.progress) if not item.is_at_bound]
         for count in range(1, len(shown) + 1):
-            found = self._with_components(there, shown[:count], best, windows)
-            if not found.is_followed or found.quiet_cost >= best.quiet_cost:
+            wider = self._with_components(there, shown[:count], best, windows)
+            if not wider.is_followed or wider.quiet_cost >= best.quiet_cost:
                 break
-            best = found
+            best = wider
             if best.is_explained:
                 break
         return best

@@ -189,8 +189,8 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
             continue
         origin = item.remark or f"from {data.name}"
         remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, {origin}"
-        said = item.remark if item.is_taken else row.meaning
-        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({said})")
+        source = item.remark if item.is_taken else row.meaning
+        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({source})")
         value = written_value(machine, row, item.value, _bounds(row, item.value))
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
@@ -262,11 +262,11 @@ def _with_noise_and_delays(
 
     written = _written(machine, changed)
     done = [f"{counted(len(lines), 'level')} in [{table}]" for table, lines in tables.items() if lines]
-    said = f"written: {', '.join(done)}" if done else "the data determine no level: all stay as they are"
-    echo(f"{machine.path}: {said}", err=True)
+    outcome = f"written: {', '.join(done)}" if done else "the data determine no level, so all stay as they are"
+    echo(f"{machine.path}: {outcome}", err=True)
     for item in late:
-        said = f'{item.name} is {1e3 * item.value:.3g} ms late: written: delay = "{1e3 * item.value:.4g} ms"'
-        echo(f"{machine.path}: {said} under [signals]", err=True)
+        delay = f'{item.name} is {1e3 * item.value:.3g} ms late; written: delay = "{1e3 * item.value:.4g} ms"'
+        echo(f"{machine.path}: {delay} under [signals]", err=True)
     return written
 
 
