@@ -5,12 +5,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import click
 from rich.table import Table
 
-from benchmarks.changes import calibration, classes, healthy, steps
+from benchmarks.changes import calibration, classes, healthy, reports, steps
 from benchmarks.changes.observe import CHANGED_WINDOWS, HEALTHY_WINDOWS, observe_all
 from benchmarks.command_line import Options, in_processes, print_pages, with_options
 
@@ -145,6 +146,34 @@ def calibration_command(options: Options, runs: int, *, listed: bool) -> None:
         lines = [f"{'right' if result.right else 'wrong'}: {result.name}: {result.text}" for result in results]
         print_pages(stated, kinds, *(lines if listed else ()))
     sys.exit(0 if calibration.met(results) else 1)
+
+
+@main.command("reports")
+@click.argument("names", nargs=-1)
+@click.option("--against", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="File of --json before.")
+@with_options
+def reports_command(options: Options, names: tuple[str, ...], against: Path | None) -> None:
+    """Reports of fixed runs, to show that a change of the code leaves them as they were.
+
+    Only runs whose names contain one of NAMES; all by default. The exit code is 1 if one differs from the file AGAINST
+    by more than 1e-6 of a number.
+    """
+    selected = _selected(reports.names(), names, str)
+    results = in_processes([partial(reports.run, name, options.seed) for name in selected], options.processes)
+    documents = dict(zip(selected, results, strict=True))
+    if options.as_json:
+        click.echo(json.dumps(documents))
+        return
+    before = {} if against is None else json.loads(against.read_text())
+    table = Table("run", "fingerprint", "decisions", "against the file")
+    is_close = True
+    for name, own in documents.items():
+        difference = reports.compare(own, before[name]) if name in before else None
+        is_close = is_close and (difference is None or difference.is_close)
+        decisions = " ".join(document["decision"][:10] for document in own)
+        table.add_row(name, reports.fingerprint(own), decisions, "" if difference is None else difference.text)
+    print_pages(table)
+    sys.exit(0 if is_close else 1)
 
 
 def _selected(items: list[Any], names: Sequence[str], name_of: Callable[[Any], str]) -> list[Any]:

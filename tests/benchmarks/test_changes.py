@@ -131,12 +131,16 @@ def test_runs_that_are_simulated_together_are_those_simulated_alone() -> None:
     assert together[1] == alone[0]
 
 
-def run(*arguments: str) -> Any:
-    command = [sys.executable, "-m", "benchmarks.changes", *arguments, "--json", "--processes", "1"]
+def printed(*arguments: str) -> str:
+    command = [sys.executable, "-m", "benchmarks.changes", *arguments, "--processes", "1"]
     process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=3600, check=False)
     assert process.returncode in (0, 1), process.stderr
     assert re.fullmatch(r"(\d+ of \d+ parts\n)+", process.stderr), process.stderr
-    return json.loads(process.stdout)
+    return process.stdout
+
+
+def run(*arguments: str) -> Any:
+    return json.loads(printed(*arguments, "--json"))
 
 
 def test_classes_prints_what_the_reports_state() -> None:
@@ -162,6 +166,12 @@ def test_calibration_prints_a_table() -> None:
     document = run("calibration", "--runs", "1")
     assert len(document["cases"]) == 1
     assert sum(own["count"] for own in document["decisions"]) == 1
+
+
+def test_reports_are_the_same_in_every_run(tmp_path: Path) -> None:
+    before = tmp_path / "before.json"
+    before.write_text(json.dumps(run("reports", "step of R_a")))
+    assert "the same" in printed("reports", "step of R_a", "--against", str(before))
 
 
 def test_interchangeable_changes_are_stated_as_classes() -> None:

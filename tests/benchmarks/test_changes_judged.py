@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from benchmarks.changes import calibration, classes, healthy, steps
+from benchmarks.changes import calibration, classes, healthy, reports, steps
 from benchmarks.changes.machines import DC_MOTOR, twin_of
 from benchmarks.changes.observe import Case, Observed, Published, Stated, coverage
 from benchmarks.changes.plants import HEALTHY, generator, simulate
@@ -229,3 +229,15 @@ def test_a_drawn_component_moves_an_output_by_as_much_as_drawn() -> None:
     low, high = calibration.EFFECT
     assert 0.3 * low <= min(moved) <= max(moved) <= 3.0 * high
     assert max(moved) > 3.0 * min(moved)
+
+
+def test_reports_are_the_same_only_bit_for_bit() -> None:
+    before = [{"decision": "learned", "fit": {"cost": 1.0, "notes": ["a"]}}]
+    assert reports.compare(before, before) == reports.Difference(0.0, ())
+    near = reports.compare([{"decision": "learned", "fit": {"cost": 1.0 + 1e-9, "notes": ["a"]}}], before)
+    assert near.is_close
+    assert near.largest > 0.0
+    far = [{"decision": "learned", "fit": {"cost": 1.1, "notes": ["a"]}}]
+    other = [{"decision": "learned", "fit": {"cost": 1.0, "notes": ["a", "b"]}}]
+    assert not any(reports.compare(own, before).is_close for own in (far, other, [], [{"decision": "learned"}]))
+    assert reports.fingerprint(far) != reports.fingerprint(before) == reports.fingerprint([{**before[0]}])
