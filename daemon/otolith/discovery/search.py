@@ -190,9 +190,11 @@ def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis
     while best is not None and len(best.problem.components) < MAX_COMPONENTS:
         if _convincing([*fitted, *more]) not in (None, best):
             break
-        best = _with_another_component(best)
-        if best is not None:
-            more += [best, *_sub_structures(best, [*fitted, *more])]
+        further = _best_of(_with_another_component(best, MAX_CANDIDATES // 2))
+        if further is None or _gain(further, best) / discount(further.chi_square, best.fit.count) <= DECISIVE:
+            break
+        more += [further, *_sub_structures(further, [*fitted, *more])]
+        best = further
     return more
 
 
@@ -345,40 +347,42 @@ def _several_moved(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
     Without them a component would take the place of a second known parameter.
     """
     single = [item for item in fitted if item.type is FaultType.PARAMETER and item.hypothesis.added == 1]
-    count = fitted[0].fit.count
     best, more = min(single, key=_chi_square, default=None), list[FittedHypothesis]()
     while best is not None and not best.fit.is_explained and best.hypothesis.added < MAX_MOVED:
         response = LinearResponse(best.fit.linearised_at_end())
         named = [row for row in _would_explain_most(best.problem, response) if row[0] not in best.name.split(", ")]
         proposals = [_moved(best.problem, best.fit.prior, label, number, best) for label, number in named]
-        further = min(fit_hypotheses(proposals, best.fit.window, FAR_WORSE), key=_chi_square, default=None)
-        if further is None or best.evidence(count, 1.0).over(further.evidence(count, 1.0)) <= DECISIVE:
+        further = _best_of(fit_hypotheses(proposals, best.fit.window, FAR_WORSE))
+        if further is None or _gain(further, best) <= DECISIVE:
             break
         more.append(further)
         best = further
     return more
 
 
-def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
-    """Return the best hypothesis with one more component of the machine, or None if it gains nothing decisive."""
-    window = best.fit.window
-    screening = screening_test(best.fit.linearised_at_end())
+def _best_of(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
+    """Return the most probable one of hypotheses that state one thing more than the same other one."""
+    return min(fitted, key=lambda item: item.evidence(item.fit.count, 1.0).deviance, default=None)
+
+
+def _gain(further: FittedHypothesis, before: FittedHypothesis) -> float:
+    """Return by how much -2 log evidence falls from ``before`` to ``further``, not discounted."""
+    count = before.fit.count
+    return before.evidence(count, 1.0).over(further.evidence(count, 1.0))
+
+
+def _with_another_component(fitted: FittedHypothesis, first: int = MAX_CANDIDATES) -> list[FittedHypothesis]:
+    """Fit the hypotheses of one more component of the machine beside ``fitted``; none where that leaves nothing.
+
+    Of the candidates the ``first`` are fitted, and those with thresholds, which the linear response underrates.
+    """
+    screening = screening_test(fitted.fit.linearised_at_end())
     if not screening.is_positive:
-        return None
+        return []
     candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
-    half = MAX_CANDIDATES // 2
-    chosen = candidates[:half] + [item for item in candidates[half:] if item.component.model.threshold_like]
-    proposals = [with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in chosen]
-    count = best.fit.count
-    further = min(
-        _possible(fit_hypotheses(proposals, window, FAR_WORSE)),
-        key=lambda item: item.evidence(count, 1.0).deviance,
-        default=None,
-    )
-    if further is None:
-        return None
-    gain = best.evidence(count, 1.0).over(further.evidence(count, 1.0))
-    return further if gain / discount(further.chi_square, count) > DECISIVE else None
+    chosen = candidates[:first] + [item for item in candidates[first:] if item.component.model.threshold_like]
+    proposals = [with_candidate(fitted.problem, fitted.fit.prior, candidate, fitted) for candidate in chosen]
+    return _possible(fit_hypotheses(proposals, fitted.fit.window, FAR_WORSE))
 
 
 def _sub_structures(whole: FittedHypothesis, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
@@ -407,14 +411,9 @@ def _possible(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
 
 def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
     """Fit components under the initial prior: a twin that always lacked one has wrong parameters."""
-    problem, window = null.problem, null.fit.window
-    (moved,) = fit_hypotheses([all_parameters_moved(problem, null.fit.prior.mean)], window)
-    screening = screening_test(moved.fit.linearised_at_end())
-    if not screening.is_positive:
-        return []
-    candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
-    proposals = [with_candidate(problem, moved.fit.prior, candidate, moved) for candidate in candidates]
-    return _possible(fit_hypotheses(proposals, window, FAR_WORSE))
+    proposal = all_parameters_moved(null.problem, null.fit.prior.mean)
+    (moved,) = fit_hypotheses([proposal], null.fit.window)
+    return _with_another_component(moved)
 
 
 def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:
