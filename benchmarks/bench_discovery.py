@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.discovery.motor import PERIOD, Faults, J, simulate_motor, windows
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state, with_problem
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 

@@ -21,7 +21,7 @@ from benchmarks.changes.machines import DC_MOTOR, PUMP, REVERSING_MOTOR, SERVO_A
 from benchmarks.changes.observe import Case, Observed, Stated, observe
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Term, generator, simulate
 from otolith.acquisition.window import Array
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 
 PLANTS = (DC_MOTOR, REVERSING_MOTOR, PUMP, SERVO_AXIS, TWO_MASS)
 KINDS = {"nothing": 0.1, "component": 0.4, "gain": 0.15, "offset": 0.15, "parameter": 0.2}

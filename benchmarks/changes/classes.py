@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.changes.machines import DC_MOTOR, FLAT_PUMP, LAB_MOTOR, ONE_MASS, PUMP, REVERSING_MOTOR
 from benchmarks.changes.observe import Case, Coverage, Observed, Stated, coverage
 from benchmarks.changes.plants import Change, Plant, Term
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 
 EQUAL = 0.01  # difference of two probabilities that count as the same
 VERDICT_WINDOWS = 5  # after the change

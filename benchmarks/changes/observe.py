@@ -12,7 +12,7 @@ from benchmarks.command_line import in_processes
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 

@@ -13,7 +13,7 @@ from benchmarks.changes.classes import EQUAL
 from benchmarks.changes.machines import LIBRARY_PLANTS
 from benchmarks.changes.observe import Case, Observed, coverage
 from benchmarks.changes.plants import Change
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 
 FROM_WINDOW = 3  # after the step
 SIZE = 0.2

@@ -18,7 +18,7 @@ from benchmarks.paper.scenarios import (
 from benchmarks.paper.study import LENGTH, PERIOD, SEED, Curves, Kind, OnProgress, StepCounter, curves, reports_of
 from otolith.acquisition.window import Array, Window
 from otolith.cli.common import shipped_directory
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.schema import ComponentDocument, Report, ReportDocument
 from otolith_drivers.plant.faults import Step, Unbalance
 from otolith_drivers.plant.scenario import Scenario, load_scenario

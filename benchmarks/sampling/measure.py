@@ -13,7 +13,7 @@ from benchmarks.sampling.bound import efficient_estimate
 from benchmarks.sampling.plant import Motor
 from benchmarks.sampling.schedules import NOISE, Recording, Schedule, record
 from otolith.acquisition.window import Array, Mask
-from otolith.discovery.decision import ACCEPTED
+from otolith.discovery.alternatives import ACCEPTED
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ParameterDocument, ReportDocument, Status
 from otolith.machine import LoadedMachine, load_machine

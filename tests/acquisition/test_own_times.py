@@ -25,7 +25,7 @@ from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
 
 from otolith.acquisition.window import Verdict, Window
 from otolith.cli.replay import replay
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.health.schema import FindingKind, ReportDocument
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded

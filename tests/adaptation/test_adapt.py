@@ -10,7 +10,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.decision import ACCEPTED, UPDATES, PosteriorUpdate, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.estimation import data_checks
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem

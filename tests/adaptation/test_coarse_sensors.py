@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.estimation.objective import WHITE_ROUNDING, adc_step, rounding_variance
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument

@@ -12,7 +12,7 @@ from benchmarks.changes.plants import HEALTHY, Plant, Values
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from tests.discovery.test_search import run
 from tests.noisy_axis import recorded
 from tests.variants import often

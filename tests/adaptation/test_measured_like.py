@@ -6,7 +6,7 @@ import pytest
 
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from tests.adaptation.measured_like import (
     TRUTH,

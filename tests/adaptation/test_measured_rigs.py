@@ -11,7 +11,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.commissioning.identification import identify_noise
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import fit

@@ -8,7 +8,7 @@ from benchmarks.sampling.measure import FREE, replayed, write_machine
 from benchmarks.sampling.plant import Inputs, Motor, simulate
 from benchmarks.sampling.schedules import NOISE, OUTPUTS, Schedule, Timing
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.schema import Status
 from otolith.machine import load_machine
 from tests.variants import often

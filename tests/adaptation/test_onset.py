@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.schema import ReportDocument
 from tests.adaptation.measured_like import TRUTH, Imperfections, motor_problem, motor_windows, reports
 

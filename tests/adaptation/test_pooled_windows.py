@@ -14,7 +14,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning import structure as module
 from otolith.commissioning.structure import MAX_PAUSE, MAX_WINDOWS, PooledWindows, Structure
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, fit

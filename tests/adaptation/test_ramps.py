@@ -11,7 +11,7 @@ from benchmarks.changes.plants import HEALTHY, Change
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 from otolith_drivers.plant.dc_motor import MotorScenario

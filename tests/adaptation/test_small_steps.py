@@ -10,7 +10,7 @@ from benchmarks.changes.machines import ONE_MASS, twin_of
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation import imm_filter
 from otolith.estimation.imm_filter import ParameterCusum, shift_limit
 from otolith.estimation.information import Prior

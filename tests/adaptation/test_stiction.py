@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import read

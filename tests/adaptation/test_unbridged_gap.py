@@ -9,7 +9,7 @@ from benchmarks.sampling.measure import replayed
 from benchmarks.sampling.plant import Motor
 from benchmarks.sampling.schedules import Recording, Samples, Schedule, Timing, record
 
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
 

@@ -10,7 +10,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.reporting import OPEN
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin

@@ -10,7 +10,7 @@ from benchmarks.changes.machines import DC_MOTOR, twin_of
 from benchmarks.changes.observe import Case, Observed, Published, Stated, coverage
 from benchmarks.changes.plants import HEALTHY, generator, simulate
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 
 PUMP_TRIAL = next(trial for trial in classes.trials(0, 2) if trial.pair == "k_v / gain of u")
 SUSPECTED, AMBIGUOUS = WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS

@@ -2,7 +2,7 @@
 
 import pytest
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.schema import LANGUAGES, Language
 from otolith.health.text import texts_in
 

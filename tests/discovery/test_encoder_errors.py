@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.health.schema import ReportDocument
 from tests.adaptation.test_pooled_windows import STATED, run

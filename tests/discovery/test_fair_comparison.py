@@ -13,9 +13,9 @@ from benchmarks.changes.plants import Change, Term
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.candidate_forms import scales_a_sum
 from otolith.discovery.candidates import Candidate
-from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,

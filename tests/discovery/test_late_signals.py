@@ -14,7 +14,7 @@ from benchmarks.sampling.schedules import Recording, Samples, Schedule, Timing, 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status

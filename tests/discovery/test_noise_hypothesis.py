@@ -14,8 +14,8 @@ from benchmarks.discovery.motor import Faults
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
-from otolith.discovery.hypotheses import FittedHypothesis, describe_noise, nothing_happened
+from otolith.discovery.alternatives import WindowDecision, describe_noise
+from otolith.discovery.hypotheses import FittedHypothesis, nothing_happened
 from otolith.discovery.noise_hypothesis import noisier_signals
 from otolith.discovery.screening import linearised
 from otolith.estimation.information import initial_prior

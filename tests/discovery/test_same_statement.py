@@ -7,7 +7,7 @@ from benchmarks.changes.machines import DC_MOTOR, LAB_MOTOR, PUMP, SERVO_AXIS, t
 from benchmarks.changes.observe import Case, observe
 from benchmarks.changes.plants import Change, Plant, Term
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.same_statement import parameters_like, without_repetitions
 from otolith.estimation.problem import Component, augment

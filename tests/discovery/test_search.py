@@ -19,7 +19,8 @@ from otolith.adaptation.state import (
     initial_state,
     restore_components,
 )
-from otolith.discovery.decision import Approval, WindowDecision
+from otolith.discovery.alternatives import WindowDecision
+from otolith.discovery.decision import Approval
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status

@@ -5,16 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.discovery.decision import WindowDecision, decide
-from otolith.discovery.hypotheses import (
-    FaultHypothesis,
-    FaultType,
-    TrackedHypothesis,
-    is_usable,
-    prune,
-    without_insignificant,
-)
-from otolith.discovery.sequential_test import FilterEvidence, SequentialTest, WindowCounts, join
+from otolith.discovery.alternatives import WindowDecision
+from otolith.discovery.decision import decide
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis
+from otolith.discovery.same_statement import prune, without_insignificant
+from otolith.discovery.sequential_test import FilterEvidence, SequentialTest, WindowCounts, is_usable, join
 from otolith.estimation.evidence import LogEvidence
 from otolith.estimation.information import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from otolith.acquisition.window import Array
 from otolith.cli.main import cli
 from otolith.commissioning.identification import identify_noise
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.observations import SENSORS
 from otolith.health.schema import ReportDocument
 from otolith.health.text import finding_text

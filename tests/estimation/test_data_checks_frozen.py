@@ -11,7 +11,7 @@ from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, TimeGrid, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.data_checks import check_window
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.data_checks import MIN_REPEATED_RUN, drop_repeats, repeated_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status

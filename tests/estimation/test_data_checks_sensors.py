@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.data_checks import spike_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status

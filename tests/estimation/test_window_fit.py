@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import Identifiability, inflation_of, initial_prior
 from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem, SwarmOptions

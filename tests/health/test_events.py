@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.discovery.decision import Approval, WindowDecision
+from otolith.discovery.alternatives import WindowDecision
+from otolith.discovery.decision import Approval
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from otolith.cli.operation.live_table import LiveTable
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import Outcome
 from otolith.health.diagnosis import FindingFeatures, OwnRule, Rule, severity
 from otolith.health.events import KNOWN_WINDOWS, HealthState, assess

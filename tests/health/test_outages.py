@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.events import HealthState
 from otolith.health.limits import Level
 from otolith.health.observations import DAEMON, PERSISTENT_WINDOWS

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.prognosis import QUANTITY, SHARES, coverage, median_error, run, run_motor
 
 from otolith.acquisition.window import Array
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.events import HealthState, assess
 from otolith.health.prognosis import (
     MAX_POINTS,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.observations import MIN_RETURNS, PERSISTENT_WINDOWS, RELEASE_WINDOWS
 from otolith.health.schema import EventChange, FindingKind, Status

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from otolith.acquisition.window import Verdict
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import Identifiability, ParameterEstimate
 from otolith.health.schema import ParameterDocument, QualityDocument, ReportDocument, Status, WindowDocument
 from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish

@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, ReportDocument
 from otolith.health.text import announcements

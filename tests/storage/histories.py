@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from otolith.acquisition.window import Verdict
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.schema import (
     CountersDocument,

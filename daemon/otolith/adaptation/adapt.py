@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
+from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
@@ -21,11 +21,10 @@ from otolith.adaptation.state import (
 )
 from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO, InputNoiseSums
 from otolith.commissioning.structure import PooledWindows
+from otolith.discovery.alternatives import DATA_FAULTS, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import (
     MAX_COST,
     AdoptedComponent,
-    PosteriorUpdate,
-    WindowDecision,
     WindowOutcome,
     adopt,
     count_fading,

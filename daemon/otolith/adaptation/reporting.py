@@ -10,28 +10,25 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
 from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows
-from otolith.discovery.decision import (
+from otolith.discovery.alternatives import (
     ACCEPTED,
+    ALTERNATIVES,
+    CHANGING,
     COMPONENT_PROBABILITY,
     COMPONENT_WINDOWS,
+    DATA_FAULTS,
+    POLLED,
     UPDATES,
-    AdoptedComponent,
-    Alternative,
-    Approval,
     PosteriorUpdate,
     WindowDecision,
-    alternatives_of,
-)
-from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import (
-    CHANGING,
-    POLLED,
-    FaultType,
     describe_hypothesis,
     describe_levels,
     describe_setting,
     is_noisier_than_stated,
 )
+from otolith.discovery.decision import AdoptedComponent, Alternative, Approval, alternatives_of
+from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
@@ -72,7 +69,6 @@ DISAGREEMENT = (
 )
 UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
-DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
 CHANGED = "something has changed"
@@ -81,7 +77,6 @@ NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves errors of
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the noise is not as large as [noise] or [process_noise] says"
 NOISE_SETTING = "if the machine is well, write what was found into [noise] or [process_noise]"
-CONDITIONS = {FindingKind.SENSOR: str(FaultType.SENSOR), FindingKind.TIMING: str(FaultType.TIMING)}
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
 
@@ -433,10 +428,11 @@ def _polled_finding(command: str, since: float) -> FindingDocument:
 
 def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: str) -> FindingDocument:
     """Return the finding of a test that is still open after ``decision``."""
-    kind, subject = _kind_and_subject(decision, test)
+    fault = _data_fault(decision, test)
+    kind, subject = _kind_and_subject(decision, test, fault)
     text = _hypotheses_text(test)
-    leading = next((item for item in test.hypotheses if item.type is FaultType.TIMING), test.best)
-    condition = CONDITIONS.get(kind, AMBIGUOUS_CONDITION) if test.explains_window else NOT_EXPLAINED
+    condition = AMBIGUOUS_CONDITION if fault is None else str(fault.type)
+    condition = condition if test.explains_window else NOT_EXPLAINED
     return FindingDocument(
         id=f"{kind}/{subject}" if subject else "undecided",
         kind=kind,
@@ -446,7 +442,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
         advice=experiment,
-        setting=describe_setting(leading if kind is FindingKind.TIMING else test.best) or _corrected_value(test),
+        setting=describe_setting(fault or test.best) or _corrected_value(test),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
     )
 
@@ -466,18 +462,21 @@ def _share(probability: float) -> str:
     return ">99%" if probability > 0.99 else "<1%" if probability < 0.01 else f"{probability:.0%}"
 
 
-def _kind_and_subject(decision: WindowDecision, test: SequentialTest) -> tuple[FindingKind, str]:
-    """Return what an open test is about: a sensor, a late signal, a class of hypotheses, or not known yet."""
+def _data_fault(decision: WindowDecision, test: SequentialTest) -> TrackedHypothesis | None:
+    """Return the hypothesis that data are wrong on which ``decision`` rests; None if it rests on none."""
+    own = (item for item in test.hypotheses if decision in DATA_FAULTS)
+    return next((item for item in own if ALTERNATIVES[item.type].decision is decision), None)
+
+
+def _kind_and_subject(
+    decision: WindowDecision, test: SequentialTest, fault: TrackedHypothesis | None
+) -> tuple[FindingKind, str]:
+    """Return what an open test is about: wrong data, a class of hypotheses, or not known yet."""
     if decision is WindowDecision.AMBIGUOUS:
         return FindingKind.CLASS, ""
-    fault = {WindowDecision.SENSOR: FaultType.SENSOR, WindowDecision.TIMING: FaultType.TIMING}.get(decision)
-    excluding = next((item for item in test.hypotheses if item.type is fault), None)
-    if excluding is None:
-        return (FindingKind.MOVED, moved) if (moved := _moved_known(test)) else (FindingKind.OPEN, "")
-    if fault is FaultType.TIMING:
-        return FindingKind.TIMING, excluding.problem.delays[0][0]
-    sites = [site_of(excluding.problem.base_model, item.site).into for item in excluding.problem.components[-1:]]
-    return FindingKind.SENSOR, sites[0] if sites else ""
+    if fault is not None:
+        return FindingKind[fault.type.name], (ALTERNATIVES[fault.type].places(fault) or ("",))[-1]
+    return (FindingKind.MOVED, moved) if (moved := _moved_known(test)) else (FindingKind.OPEN, "")
 
 
 def _moved_known(test: SequentialTest) -> str:

@@ -18,7 +18,7 @@ from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.console import Localised, Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, texts_of, title
 from otolith.cli.terminal import echo
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.schema import EventDocument, FindingKind, ReportDocument, Status
 from otolith.health.text import PARTS, Texts, component_text, event_text, headline, undecided_text, value_cells, zone_of
 from otolith.health.times import clock_in, in_local_time

@@ -5,86 +5,29 @@ Of an adopted component: since when and how surely it is in the twin, approved o
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from enum import Enum, StrEnum
+from enum import StrEnum
 
-from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
+from otolith.discovery.alternatives import (
+    ALTERNATIVES,
+    UPDATES,
+    AlternativeRow,
+    PosteriorUpdate,
+    WindowDecision,
+    describe_hypothesis,
+)
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
-STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
-COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # windows that must agree on a component, and its probability
-TIMING_WINDOWS = 2  # windows that must agree on a late signal
-DATA_FAULT_PROBABILITY = 0.8  # of a faulty sensor or a late signal, if no other type explains the windows as well
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
 BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no sensor, delay or component is accepted
-
-
-class WindowDecision(StrEnum):
-    """What a window led to."""
-
-    LEARNED = "learned"
-    SUSPECTED = "it contradicts the prediction: a sudden change or a wrong window; further windows decide"
-    STEPPED = "two windows agree on a sudden change"
-    DISCOVERED = "several windows agree on a new component"
-    FADED = "a component is no longer there"
-    NOISIER = "several windows agree that a signal is less certain than stated"
-    AMBIGUOUS = "several hypotheses explain the windows equally well: what they agree on is estimated"
-    SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
-    TIMING = "a signal is late: its delay does not count as a change of a parameter"
-    BAD = "the window is not good enough: it does not update the estimates"
-    REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
-
-    @property
-    def in_words(self) -> str:
-        """What a person reads; the value is what programs read."""
-        return IN_WORDS.get(self, self.value)
-
-
-IN_WORDS = {
-    WindowDecision.SUSPECTED: (
-        "this window differs from the prediction: it may be a sudden change or an outlier, and the next windows decide"
-    ),
-    WindowDecision.STEPPED: "two windows show the same sudden change",
-    WindowDecision.DISCOVERED: "several windows show the same new component",
-    WindowDecision.NOISIER: "several windows show other noise than is stated",
-    WindowDecision.AMBIGUOUS: (
-        "several hypotheses explain the windows equally well: estimated is what they have in common"
-    ),
-}
-"""What people read where the value, which programs read, has to be read twice."""
-
-
-class PosteriorUpdate(Enum):
-    """How a window changes the posterior."""
-
-    NONE = "the posterior of the window before stays"
-    FILTER = "the filter is updated with the window"
-    HYPOTHESIS = "the posterior of the accepted hypothesis replaces the filter's"
-
-
-UPDATES = {
-    WindowDecision.LEARNED: PosteriorUpdate.FILTER,
-    WindowDecision.STEPPED: PosteriorUpdate.HYPOTHESIS,
-    WindowDecision.DISCOVERED: PosteriorUpdate.HYPOTHESIS,
-    WindowDecision.FADED: PosteriorUpdate.HYPOTHESIS,
-    WindowDecision.NOISIER: PosteriorUpdate.HYPOTHESIS,
-    WindowDecision.SUSPECTED: PosteriorUpdate.NONE,
-    WindowDecision.AMBIGUOUS: PosteriorUpdate.NONE,
-    WindowDecision.SENSOR: PosteriorUpdate.NONE,
-    WindowDecision.TIMING: PosteriorUpdate.NONE,
-    WindowDecision.BAD: PosteriorUpdate.NONE,
-    WindowDecision.REFUSED: PosteriorUpdate.NONE,
-}
-DATA_FAULTS = {FaultType.SENSOR: (WindowDecision.SENSOR, 0), FaultType.TIMING: (WindowDecision.TIMING, TIMING_WINDOWS)}
-"""For each type of hypothesis about faulty data: its decision, and how many windows must agree."""
-ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,31 +58,39 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     if test.is_ambiguous:
         several = test.counts.since_search >= AMBIGUOUS_WINDOWS
         return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
-    agreed = test.counts.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
-    if best.type is FaultType.NOISE and agreed:
-        return WindowOutcome(WindowDecision.NOISIER, best)
-    own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
-    if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
-        return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    # If it leaves structure, the cause may be none of the hypotheses.
-    if not best.leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
-        return fault if _is_plausible(fault.hypothesis) else WindowOutcome(WindowDecision.SUSPECTED, fault.hypothesis)
-    if _is_component_accepted(test) and (chosen := _without_undecided_terms(test)).type is FaultType.COMPONENT:
-        return WindowOutcome(WindowDecision.DISCOVERED if _is_plausible(chosen) else WindowDecision.SUSPECTED, chosen)
+    for kind, row in ALTERNATIVES.items():
+        if _is_agreed(test, row, kind, is_young=is_young) and (outcome := _outcome(test, row, kind)) is not None:
+            return outcome
     return WindowOutcome(WindowDecision.SUSPECTED, best)
 
 
-def _data_fault(test: SequentialTest, *, is_young: bool) -> WindowOutcome | None:
-    """Return the decision for a faulty sensor or a late signal; None if neither is probable enough.
+def _is_agreed(test: SequentialTest, row: AlternativeRow, kind: FaultType, *, is_young: bool) -> bool:
+    """Whether enough windows agree that a hypothesis of type ``kind`` is probable enough.
 
-    If ``is_young``, few windows have updated the filter, and sensors are as little known as components.
+    If ``is_young``, few windows have updated the filter. Where even the best hypothesis leaves structure, the cause may
+    be none of the hypotheses, and no data are wrong.
     """
-    for kind, (decision, windows) in DATA_FAULTS.items():
-        needed = COMPONENT_WINDOWS if is_young and kind is FaultType.SENSOR else windows
-        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.counts.leading >= needed:
-            accepted = next(item for item in test.hypotheses if item.type is kind)
-            return WindowOutcome(WindowDecision.SUSPECTED if _is_below_noise(accepted) else decision, accepted)
-    return None
+    best, needed = test.best, max(row.windows, row.windows_while_young if is_young else 0)
+    may_be = not best.leaves_structure if row.is_of_data else best.type is kind
+    return may_be and test.counts.leading >= needed and test.probability(kind) >= row.probability
+
+
+def _outcome(test: SequentialTest, row: AlternativeRow, kind: FaultType) -> WindowOutcome | None:
+    """Return the decision for the best hypothesis of a type on which windows agree; None where it is not certain."""
+    accepted, decision = next(item for item in test.hypotheses if item.type is kind), row.decision
+    if decision is WindowDecision.NOISIER:
+        return WindowOutcome(decision, accepted)
+    if decision is WindowDecision.STEPPED:
+        own, known = ({parameter.label for parameter in each.free} for each in (accepted.problem, test.problem))
+        fewer = WindowOutcome(WindowDecision.FADED, accepted) if own < known else None  # a component is insignificant
+        return WindowOutcome(decision, accepted) if own == known else fewer
+    if decision is WindowDecision.DISCOVERED:
+        is_alone = test.counts.tested >= MAX_OPEN_WINDOWS or not test.alternatives(accepted)
+        accepted = _without_undecided_terms(test)
+        if not is_alone or accepted.type is not kind:
+            return None
+    is_certain = _is_plausible(accepted) and not _is_below_noise(accepted)
+    return WindowOutcome(decision if is_certain else WindowDecision.SUSPECTED, accepted)
 
 
 def _is_plausible(hypothesis: TrackedHypothesis) -> bool:
@@ -147,13 +98,6 @@ def _is_plausible(hypothesis: TrackedHypothesis) -> bool:
     rows = zip(hypothesis.problem.free, hypothesis.posterior.prior().mean.tolist(), strict=False)  # then come trends
     own = [(free, value) for free, value in rows if free.low > 0.0 and not free.name.startswith("_")]
     return all(free.low / BEYOND_BOUNDS <= value <= free.high * BEYOND_BOUNDS for free, value in own)
-
-
-def _is_component_accepted(test: SequentialTest) -> bool:
-    """Whether windows agree on a component, and no other hypothesis explains them as well."""
-    leads = test.best.type is FaultType.COMPONENT and test.counts.leading >= COMPONENT_WINDOWS
-    probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
-    return leads and probable and (test.counts.tested >= MAX_OPEN_WINDOWS or not test.alternatives(test.best))
 
 
 def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:

@@ -1,4 +1,4 @@
-"""Components that state no more than that a parameter of the twin has changed.
+"""Hypotheses that state no more than another: nothing beside the null hypothesis, or what a parameter states as well.
 
 A voltage c·i in the armature circuit enters the equation of the current as R_a·i does: it is R_a, changed by c. No data
 tell the two apart, so they are one statement, and the parameter makes it. This holds for the equations, whatever the
@@ -6,18 +6,23 @@ machine does; that a window does not tell two statements apart is another matter
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.alternatives import ALTERNATIVES
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, names_of
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
-from otolith.estimation.problem import Problem, indices
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import Problem, amplitude_indices, indices
 from otolith.twin.definition import Definition, Input, Parameter, StateVariable
 from otolith.twin.rates import right_sides
 
+SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
+DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 TRIALS, MIN_TRIALS = 64, 8  # random values of states and inputs at which effects are compared; least with any effect
 STEP = 1e-4  # of the width of a parameter's bounds, and of the right side for a component: what gives an effect
 SAME_EFFECT = 1e-5  # of the largest effect on an equation: difference of two effects that are the same
@@ -29,6 +34,72 @@ def without_repetitions(tracked: Sequence[TrackedHypothesis], problem: Problem) 
     ``problem`` is that of the filter. The other must explain the windows as well: a fit may have failed.
     """
     return [item for item in tracked if not any(_states_the_same(other, item, problem) for other in tracked)]
+
+
+def prune(tracked: Sequence[TrackedHypothesis], deviances: Sequence[float]) -> list[TrackedHypothesis]:
+    """Drop hypotheses that have become equal to the null hypothesis and explained the window no better.
+
+    A window that was itself wrong may be explained by something that does not return. Quiet windows do not
+    discriminate, so evidence alone would keep such a hypothesis for ever. A parameter of the null hypothesis follows a
+    ramp too late: one that has moved stays as long as all windows together are decisively for it.
+    """
+    at = next((at for at, item in enumerate(tracked) if item.type is FaultType.NOTHING), None)
+    if at is None:
+        return list(tracked)
+    null = tracked[at]
+    return [
+        item
+        for item, deviance in zip(tracked, deviances, strict=True)
+        if item is null
+        or deviance < deviances[at] - DISCRIMINATES
+        or (item.type is FaultType.PARAMETER and item.deviance < null.deviance - DECISIVE)
+        or not _equals_null(item, null)
+    ]
+
+
+def without_insignificant(tracked: TrackedHypothesis) -> TrackedHypothesis:
+    """Return the hypothesis without its weakest component, if that is not significant (the paper's "deactivated")."""
+    if len(tracked.problem.components) < 2:
+        return tracked
+    significance = _significance(tracked.posterior)
+    weakest = int(np.argmin(significance))
+    if significance[weakest] >= SIGNIFICANT:
+        return tracked
+    posterior, hypothesis = tracked.posterior.without_slot(weakest), tracked.hypothesis
+    if ALTERNATIVES[hypothesis.type].names_components:
+        hypothesis = replace(hypothesis, name=names_of(posterior.problem.components))
+    return replace(tracked, hypothesis=hypothesis, posterior=posterior)
+
+
+def _significance(posterior: Posterior) -> Array:
+    """Return the amplitudes (components,) in their standard deviations."""
+    prior, amplitudes = posterior.prior(), amplitude_indices(posterior.problem)
+    return np.abs(prior.mean[amplitudes]) / prior.sd[amplitudes]
+
+
+def _equals_null(tracked: TrackedHypothesis, null: TrackedHypothesis) -> bool:
+    """Whether neither its additional components nor its delay nor its shifts of parameters are significant."""
+    known, own = ([item.key for item in each.problem.components] for each in (null, tracked))
+    if own[: len(known)] != known:  # it states that a component is gone
+        return False
+    if any(abs(delay) * np.sqrt(tracked.delay_information) >= SIGNIFICANT for _, delay in tracked.problem.delays):
+        return False
+    added = _significance(tracked.posterior)[len(known) :]
+    return bool((added < SIGNIFICANT).all() and (_shifts(tracked, null) < SIGNIFICANT).all())
+
+
+def _shifts(tracked: TrackedHypothesis, null: TrackedHypothesis) -> Array:
+    """Return how far its parameters (parameters,) are from those of ``null``, in standard deviations."""
+    own, other = tracked.posterior.prior(), null.posterior.prior()
+    expected = {name: (value, 0.0) for name, value in null.problem.known}
+    for at, parameter in enumerate(null.problem.free):
+        expected[parameter.name] = float(other.mean[at]), float(other.covariance[at, at])
+    shifts = []
+    for at, parameter in enumerate(tracked.problem.free):
+        if parameter.name in expected:  # others belong to a component that it adds
+            value, variance = expected[parameter.name]
+            shifts.append(abs(own.mean[at] - value) / np.sqrt(own.covariance[at, at] + variance))
+    return np.array(shifts)
 
 
 def _states_the_same(other: TrackedHypothesis, item: TrackedHypothesis, problem: Problem) -> bool:

@@ -18,25 +18,30 @@ from functools import cached_property
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.discovery.alternatives import ALTERNATIVES
 from otolith.discovery.hypotheses import (
     MAX_DEVIANCE,
+    FaultHypothesis,
     FaultType,
     FittedHypothesis,
-    HypothesisStep,
     Proposal,
     TrackedHypothesis,
-    complexity_penalty,
     evidence_factor,
-    prune,
-    track,
-    without_insignificant,
+    is_possible,
 )
 from otolith.discovery.noise_hypothesis import is_white, normalisation
-from otolith.discovery.same_statement import without_repetitions
+from otolith.discovery.same_statement import prune, without_insignificant, without_repetitions
 from otolith.discovery.screening import ScreeningResult
 from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
-from otolith.estimation.evidence import DECISIVE, NO_EVIDENCE, LogEvidence, discount, likelihood_ratios
-from otolith.estimation.information import QUANTILE, Prior
+from otolith.estimation.evidence import (
+    DECISIVE,
+    NO_EVIDENCE,
+    LogEvidence,
+    discount,
+    likelihood_ratios,
+    log_determinant,
+)
+from otolith.estimation.information import QUANTILE, Evidence, Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit
@@ -51,7 +56,44 @@ DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
 MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
 WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
-ALWAYS_TRACKED = (FaultType.NOTHING, FaultType.PARAMETER)
+MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HypothesisStep:
+    """Prediction, fit and evidence of one tracked hypothesis for one window."""
+
+    tracked: TrackedHypothesis
+    predicted: Posterior
+    fitted: FittedHypothesis
+    evidence: Evidence
+    log_evidence: LogEvidence = NO_EVIDENCE  # Of this window
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the prediction can be updated without losing all digits; always for the null hypothesis."""
+        return is_usable(self.tracked.hypothesis, self.predicted, self.evidence)
+
+    def updated(self, deviance: float, misfit: float) -> TrackedHypothesis | None:
+        """Return the hypothesis after the window, with so much more deviance and misfit.
+
+        None if the window contradicts the delay that it states, or a component leaves its physical range.
+        """
+        posterior = self.predicted.update(self.predicted.innovation(self.evidence), self.fitted.fit.advance())
+        own = self.fitted.fit
+        tracked = _with_window(replace(self.tracked, posterior=posterior), own)
+        tracked = tracked.worse_by(deviance, misfit)
+        if self.tracked.type is FaultType.COMPONENT and not is_possible(posterior.problem, posterior.prior().mean):
+            return None
+        return ALTERNATIVES[tracked.type].after_window(tracked, own)
+
+
+def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evidence) -> bool:
+    """Whether ``evidence`` can update the prediction without losing all digits; always for the null hypothesis."""
+    if hypothesis.type is FaultType.NOTHING:
+        return True
+    relative = np.abs(evidence.sqrt_information) * predicted.prior().sd
+    return bool((relative < MAX_GAIN_OF_INFORMATION).all())  # also false for not-a-number
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +291,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
     best, least_misfit = ordered[0], min(own.misfit for own in evidence.values())
     least = evidence[best].deviance
     kept = [item for item in ordered if evidence[item].deviance <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
-    kept += [item for item in ordered if item.type in ALWAYS_TRACKED and item not in kept]
+    kept += [item for item in ordered if ALTERNATIVES[item.type].is_always_tracked and item not in kept]
     tracked = []
     for item in kept:
         deviance = min(evidence[item].deviance - least, MAX_FIRST_EVIDENCE)
@@ -264,6 +306,25 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         null_reduced_chi_square=discount(null.chi_square, count),
         has_explained_unexpected=best.fit.is_explained,
     )
+
+
+def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfit: float) -> TrackedHypothesis | None:
+    """Return the hypothesis after its first window, or None if its twin all but diverges.
+
+    ``predicted`` is the prediction of what was known before the hypothesis.
+    """
+    evidence = fitted.fit.evidence()
+    own = predicted.remap_parameters(fitted.problem).set_prior(fitted.fit.prior)
+    if not is_usable(fitted.hypothesis, own, evidence):
+        return None
+    posterior = own.update(own.innovation(evidence), fitted.fit.advance())
+    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, fitted.fit.cost)
+    return ALTERNATIVES[fitted.type].after_window(_with_window(tracked, fitted.fit), fitted.fit)
+
+
+def _with_window(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis:
+    """Return the hypothesis with what it leaves of its last window."""
+    return replace(tracked, cost=fitted.cost, inflation=fitted.inflation, is_explained=fitted.is_explained)
 
 
 def follow(test: SequentialTest, window: Window) -> SequentialTest:
@@ -346,6 +407,12 @@ def _with_evidence(steps: list[HypothesisStep]) -> list[HypothesisStep]:
         replace(step, log_evidence=LogEvidence(step.fitted.chi_square, penalty, divisor))
         for step, penalty in zip(steps, penalties, strict=True)
     ]
+
+
+def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
+    """Return ln|I + R P Rᵀ|: the term of -2 log evidence that penalises an uncertain prediction."""
+    information = evidence.sqrt_information @ predicted.prior().covariance @ evidence.sqrt_information.T
+    return float(log_determinant(np.eye(len(information)) + information))
 
 
 def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisStep]) -> tuple[TrackedHypothesis, ...]:
@@ -436,9 +503,8 @@ def _place(item: TrackedHypothesis, simplest: TrackedHypothesis | None) -> tuple
 
     More moved parameters than those of the ``simplest`` hypothesis of moved parameters are a variant of it.
     """
-    if simplest is None or item.type is not FaultType.PARAMETER:
-        return item.places
-    return ((item if item.hypothesis.added <= simplest.hypothesis.added else simplest).hypothesis.name,)
+    is_variant = item.type is FaultType.PARAMETER and simplest and item.hypothesis.added > simplest.hypothesis.added
+    return ALTERNATIVES[item.type].places(simplest if simplest and is_variant else item)
 
 
 def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:

@@ -6,7 +6,7 @@ Cause and advice are those of the rule; what must be seen, what else it may be a
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from otolith.discovery.decision import COMPONENT_WINDOWS
+from otolith.discovery.alternatives import COMPONENT_WINDOWS
 from otolith.health.diagnosis import KEYS, LIMITS, Rule
 from otolith.health.limits import Level
 from otolith.health.observations import (

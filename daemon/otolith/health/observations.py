@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from otolith.discovery.decision import Approval, WindowDecision
+from otolith.discovery.alternatives import WindowDecision
+from otolith.discovery.decision import Approval
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, severity

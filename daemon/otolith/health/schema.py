@@ -10,7 +10,8 @@ from typing import Literal, get_args
 from pydantic import Field
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.discovery.decision import Approval, WindowDecision
+from otolith.discovery.alternatives import WindowDecision
+from otolith.discovery.decision import Approval
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
 from otolith.health.limits import Level

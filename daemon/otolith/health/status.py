@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 
 from otolith.acquisition.window import Window
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate, at_its_bound
 from otolith.estimation.window_fit import AT_BOUND
 from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status
