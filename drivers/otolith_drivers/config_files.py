@@ -23,6 +23,7 @@ from otolith_drivers.toml_bounds import MAX_TEXT, depth_fault, text_faults
 FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times the largest machine file
 MAX_FAULTS = 20  # lines of an error: engineering choice, more than a person mends at once
 SHOWN_KEY = 64  # characters of a key in an error
+MAX_WRITTEN = 200  # characters of a text with a pattern: engineering choice, longer than a path in a message
 
 Location = Sequence[int | str]  # Keys and list indices that lead to a value
 Model = TypeVar("Model", bound=BaseModel)
@@ -241,6 +242,17 @@ def validated(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
     except ValidationError as error:
         at, message = next(_faults(error, data, model))
         raise ConfigurationError(message, (*under, *map(str, at))) from error
+
+
+def written_as(pattern: re.Pattern[str], what: str) -> AfterValidator:
+    """Return a validator of texts that all of ``pattern`` matches; its error says that the text is no ``what``."""
+
+    def validated_text(value: str) -> str:
+        if pattern.fullmatch(value) is None or len(value) > MAX_WRITTEN:
+            raise ValueError(f"{shown(value)} is no {what}")
+        return value
+
+    return AfterValidator(validated_text)
 
 
 def dotted(location: Location) -> str:

@@ -27,6 +27,7 @@ from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.message_times import ArrivalClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver, cause_of
+from otolith_drivers.config_files import written_as
 from otolith_drivers.errors import ConfigurationError, counted, shown
 from otolith_drivers.units import Quantity
 
@@ -41,11 +42,11 @@ FIRST_WAIT = 10.0  # s without a message of a topic, after which the link has a 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MIN_RATE, RATE_SPAN = 0.1, 1.5  # s per s by which the times of messages must advance; s after which that is judged
 NAME = r"[^.\[\]\s](?:[^.\[\]]*[^.\[\]\s])?"
-PATH = re.compile(rf"{NAME}(?:\[\d+\])*(?:\.{NAME}(?:\[\d+\])*)*|(?:\[\d+\])+")
+PATH = re.compile(rf"(?:{NAME}|\[\d+\])(?:\[\d+\])*(?:\.{NAME}(?:\[\d+\])*)*")
 STEP = re.compile(r"\.?([^.\[\]]+)|\[(\d+)\]")  # from a JSON value into it
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
-FieldPath = Annotated[str, Field(pattern=f"^(?:{PATH.pattern})$", max_length=200)]
+FieldPath = Annotated[str, written_as(PATH, "path into a message, like 'speed', 'axes[0].speed' or '[0].t'")]
 
 
 class MqttOptions(CredentialOptions):

@@ -18,12 +18,13 @@ from hypothesis import strategies as st
 
 from otolith_drivers import mqtt
 from otolith_drivers.base import Sample, Sampling, Setup, Signal
+from otolith_drivers.config_files import validated
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.mqtt import MAX_PAYLOAD, Messages, at
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
 from tests.drivers.mqtt_broker import broker_of_this_process, mqtt_broker, publisher
-from tests.messages import assert_says
+from tests.messages import assert_says, raises_saying
 from tests.waiting import wait_for
 
 STEP = 0.02  # s
@@ -268,6 +269,32 @@ def test_no_value_in_a_message_raises(value: Any) -> None:
 def test_paths_reach_into_lists() -> None:
     assert at({"axes": [{"speed": 3}]}, "axes[0].speed") == 3
     assert at([[1, 2]], "[0][1]") == 2
+
+
+def test_a_list_at_the_root_is_read_by_its_index() -> None:
+    """A list of readings, as gateways collect them, arrives over a real broker; field and time name one of them."""
+    setup = setup_of(
+        i={"topic": "list/root", "field": "[1].v.i", "unit": "A"},
+        omega={"topic": "list/root", "field": "[0].n", "unit": "rad/s"},
+    )
+    port = broker_of_this_process()
+    with opened(port, setup, time="[0].t", time_format="s") as (driver, samples), publisher(port) as client:
+        wait_for(lambda: driver.link().up)
+        for index in range(40):
+            client.publish("list/root", json.dumps([{"t": 5.0 + STEP * index, "n": 7.0}, {"v": {"i": index}}]))
+            time.sleep(STEP)
+        wait_for(lambda: len(samples) == 80)
+    times = np.array([sample.time for sample in samples if sample.signal == "i"])
+    assert [sample.value for sample in samples if sample.signal == "i"] == list(range(40))
+    assert np.diff(times) == pytest.approx(STEP, abs=0.01)
+
+
+@pytest.mark.parametrize("path", ["a..b", "[x].t", "[0]..t", ".a", "a.", "[0]t", "a" * 201])
+def test_a_wrong_path_is_named_in_words(path: str) -> None:
+    tables = (({"host": "a", "time": path}, mqtt.Options), ({"topic": "t", "unit": "A", "field": path}, mqtt.Source))
+    for table, model in tables:
+        with raises_saying(ConfigurationError, path[:50], "axes[0].speed"):
+            validated(table, model, ())
 
 
 @pytest.mark.parametrize("key", ["Motor Speed", "Channel1.Device1.Speed", "DB1[0]", "a.b[0].c"])

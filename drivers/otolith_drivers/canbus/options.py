@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import ScaledSource, Signal
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT, CanDatabase
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.config_files import StrictModel, written_as
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, UnitNameError, factor
 
@@ -404,8 +404,10 @@ NUMBER_LENGTHS = {"i": range(1, 65), "u": range(1, 65), "f": (32, 64)}  # bits
 OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{1,4})(?::([0-9A-Fa-f]{1,2}))?(?:\s+(?:(bool)|([iuf])(\d{1,2})))?")
 
 FramePeriod = Annotated[float, BeforeValidator(Quantity("s", 1e-4, 3600.0))]
-HexBytes = Annotated[str, Field(pattern=r"^(?:[0-9A-Fa-f]{2}[ :]?){0,16}$")]
-NodeKey = Annotated[str, Field(pattern=r"^(?:0[xX][0-9A-Fa-f]{1,2}|\d{1,3})$")]
+HEX_BYTES = re.compile(r"(?:[0-9A-Fa-f]{2}[ :]?){0,16}")
+NODE_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,2}|\d{1,3}")
+HexBytes = Annotated[str, written_as(HEX_BYTES, "list of at most 16 bytes of two hexadecimal digits, like '1A 2B'")]
+NodeKey = Annotated[str, written_as(NODE_KEY, "number of a node, like 5 or 0x05")]
 ChecksumKind = Literal["crc8-sae-j1850", "crc8-sae-j1850-zero", "crc8-autosar", "crc16-ccitt-false", "xor", "sum8"]
 
 
