@@ -5,6 +5,7 @@ import asyncio
 import atexit
 import json
 import math
+import signal
 import socket
 import subprocess
 import sys
@@ -38,7 +39,10 @@ class OneUser:
 
 
 async def serve(options: argparse.Namespace) -> None:
-    """Serve for ever. The variable ``still`` is not renewed; the source of ``ahead`` has a clock an hour ahead."""
+    """Serve for ever. The variable ``still`` is not renewed; the source of ``ahead`` has a clock an hour ahead.
+
+    The variable ``--late`` is not there at first; each SIGUSR1 adds or removes it.
+    """
     server = Server(user_manager=OneUser() if options.user else None)
     await server.init()
     server.set_endpoint(f"opc.tcp://127.0.0.1:{options.port}/motor")
@@ -67,6 +71,8 @@ async def serve(options: argparse.Namespace) -> None:
         if unit:
             details = ua.EUInformation(DisplayName=ua.LocalizedText(unit))
             await node.add_property(ua.NodeId(f"{name}.Unit", space), ua.QualifiedName("EngineeringUnits", 0), details)
+    if options.late:
+        await _let_appear(server, nodes, options.late)
     async with server:
         sys.stdout.write("up\n")
         sys.stdout.flush()
@@ -76,9 +82,27 @@ async def serve(options: argparse.Namespace) -> None:
                 status = ua.StatusCode(ua.StatusCodes.BadSensorFailure if math.isnan(value) else ua.StatusCodes.Good)
                 stamp = now + timedelta(hours=name == "ahead")
                 new = ua.DataValue(ua.Variant(float(value)), status, SourceTimestamp=stamp, ServerTimestamp=now)
-                if name != "still":
+                if name != "still" and name in nodes:
                     await server.write_attribute_value(nodes[name].nodeid, new)
             await asyncio.sleep(PERIOD - time.time() % PERIOD)
+
+
+async def _let_appear(server: Server, nodes: dict[str, Any], name: str) -> None:
+    """Remove the variable ``name``, and add or remove it at each SIGUSR1."""
+    node, loop, tasks = nodes.pop(name), asyncio.get_running_loop(), set[asyncio.Task[None]]()
+    await server.delete_nodes([node])
+
+    async def toggle() -> None:
+        if name not in nodes:
+            nodes[name] = await server.nodes.objects.add_variable(node.nodeid, name, 0.0)
+            return
+        del nodes[name]
+        # Part 4 demands this status of a node that is removed; the library's server does not send it by itself.
+        gone = ua.DataValue(ua.Variant(0.0), ua.StatusCode(ua.StatusCodes.BadNodeIdUnknown))
+        await server.write_attribute_value(node.nodeid, gone)
+        await server.delete_nodes([node])
+
+    loop.add_signal_handler(signal.SIGUSR1, lambda: tasks.add(loop.create_task(toggle())))
 
 
 @contextmanager
@@ -110,6 +134,7 @@ if __name__ == "__main__":
     parser.add_argument("--values")
     parser.add_argument("--namespaces", default=MOTOR)
     parser.add_argument("--user", action="store_true")
+    parser.add_argument("--late")
     for name in ("--certificate", "--key", "--trusted"):
         parser.add_argument(name)
     asyncio.run(serve(parser.parse_args()))

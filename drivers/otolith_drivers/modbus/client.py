@@ -22,6 +22,7 @@ from pymodbus.exceptions import ConnectionException
 from pymodbus.framer import FramerType
 
 from otolith_drivers.common.reconnection import cause_of
+from otolith_drivers.modbus.frames import FrameFilter, SerialFilter, TcpFilter
 from otolith_drivers.modbus.options import BIT_TABLES, LineOptions, Table
 
 # Modbus Application Protocol V1.1b3, section 7.
@@ -44,9 +45,7 @@ GATEWAY_CODES = (10, 11)  # Exceptions by which a gateway reports that the devic
 
 FUNCTION_CODES: Final[dict[Table, int]] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 DRAIN_STEP = 0.02  # s between looks for late bytes; engineering choice: at most 1 % of a core
-HEADER_LENGTH = 7  # bytes of a TCP answer before its function code
 READS: Final = {1: "read_coils", 2: "read_discrete_inputs", 3: "read_holding_registers", 4: "read_input_registers"}
-REPEATED_FIELDS = (("reply_transaction", "transaction", 0, 2), ("reply_device", "device", 6, 7))
 MAX_DRAIN = 5  # timeouts, after which a line that never falls silent is reopened all the same; engineering choice
 
 
@@ -79,8 +78,8 @@ class ReadOnlyClient:
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
         self._options = options
         self._aborted = threading.Event()
-        self._headers = _HeaderFilter(options) if options.is_tcp else None
-        self._client = _client(options, self._aborted, self._headers or _EchoFilter())
+        self._filter: FrameFilter = TcpFilter(options) if options.is_tcp else SerialFilter()
+        self._client = _client(options, self._aborted, self._filter)
 
     def connect(self) -> None:
         """Open the connection; raise ConnectionLostError if it cannot be opened."""
@@ -119,8 +118,7 @@ class ReadOnlyClient:
         except ConnectionException as error:
             raise ConnectionLostError("the connection was closed") from error
         except ModbusException as error:
-            mismatch = self._headers.mismatch if self._headers is not None else ""
-            raise NoReplyError(mismatch or f"no answer within {self._options.timeout:g} s") from error
+            raise NoReplyError(self._filter.fault or f"no answer within {self._options.timeout:g} s") from error
         except OSError as error:
             raise ConnectionLostError(cause_of(error)) from error
         except Exception as error:  # the library's decoder may raise anything for corrupted bytes
@@ -205,56 +203,6 @@ class _SerialClient(ModbusSerialClient):
             size = available
             time.sleep(self._recv_interval)
         return size
-
-
-class _EchoFilter:
-    """Removes the echo of the request, which some serial adapters receive, from the answer.
-
-    With its checksum, a request for one register from 768 to 1023 is also a valid answer.
-    """
-
-    def __init__(self) -> None:
-        self._sent = b""
-
-    def __call__(self, sending: bool, data: bytes) -> bytes:
-        if sending:
-            self._sent = data
-            return data
-        return data.removeprefix(self._sent)
-
-
-class _HeaderFilter:
-    """Checks the transaction and device number of each TCP answer, and replaces those that the options expect."""
-
-    def __init__(self, options: LineOptions) -> None:
-        self.mismatch = ""  # what differed in an answer to the latest request
-        self._options = options
-        self._sent = b""
-
-    def __call__(self, sending: bool, data: bytes) -> bytes:
-        if sending:
-            self._sent, self.mismatch = data, ""
-            return data
-        answers, at = bytearray(data), 0
-        while at + HEADER_LENGTH <= len(answers):
-            if any(data[at + 2 : at + 4]):  # the number of the protocol is 0
-                is_serial = data[at : at + 2] == self._sent[6:8]
-                kind = 'an answer of a serial line: set framing = "rtu" in [driver]' if is_serial else ""
-                self.mismatch = kind or "bytes that are no answer of Modbus TCP"
-                break
-            for name, what, begin, end in REPEATED_FIELDS:
-                number, sent = (int.from_bytes(part) for part in (data[at + begin : at + end], self._sent[begin:end]))
-                if number == sent:
-                    continue
-                if number == getattr(self._options, name):
-                    answers[at + begin : at + end] = self._sent[begin:end]
-                else:
-                    self.mismatch = (
-                        f"an answer with {what} number {number} instead of {sent}: "
-                        f"if the device always answers so, set {name} = {number} in [driver]"
-                    )
-            at += 6 + max(1, int.from_bytes(data[at + 4 : at + 6]))
-        return bytes(answers)
 
 
 def _is_pseudo_terminal(port: str | None) -> bool:

@@ -45,6 +45,8 @@ KEEPALIVE = 1  # intervals without a value, after which the server sends an empt
 QUEUE_MARGIN = 4  # messages that the server's queue of a variable can hold back
 HOLD_INTERVALS = 5.0  # messages without a change, after which a value is repeated at each message
 MAX_AGE = 5.0  # s between the stamp of a value and its message; more is another clock, or a time zone
+FIRST_RETRY, LAST_RETRY = 2.0, 60.0  # s, doubled from one to the other: when missing variables are asked for again
+GONE = (ua.StatusCodes.BadNodeIdUnknown, ua.StatusCodes.BadNodeIdInvalid)  # of a variable that the server has removed
 EXPECTED = (OSError, TimeoutError, asyncio.CancelledError, ua.UaError, RefusedError)  # What ends a session
 OVERFLOW = 0x480  # info bits of a status: of a data value, values before it were dropped (Part 4, 7.39.1)
 
@@ -56,6 +58,7 @@ class NodeSignal:
     signal: Signal
     conversion: Conversion | None = None  # None until the unit is known
     node: Any = None  # Its variable on the server, a ua.NodeId; None until it is looked up
+    item: int | None = None  # Its number in the subscription, None if it is not in it
     namespace: str = ""  # URI of its namespace at the first connection
     defect: str = ""  # How its namespace has changed since then
     fault: str = ""  # Why the server does not send it; empty if it does
@@ -137,7 +140,8 @@ class Readings:
         if not abs(published - stamp) <= MAX_AGE:
             if not is_first or stamp > published:  # the first one may be as old as it likes: it is still the value
                 node.value = math.nan
-                self._reject(node, f'stamped {published - stamp:.1f} s before it was sent: set stamps = "server"', now)
+                age = f"{abs(published - stamp):.1f} s {'before' if stamp < published else 'after'}"
+                self._reject(node, f'stamped {age} it was sent: set stamps = "server"', now)
             return []
         time = min(stamp + self.clock.offset, now)
         if time < node.time:
@@ -275,8 +279,9 @@ class OpcuaSubscriber(ThreadedDriver):
             client.connection_lost_callback = self._note_loss
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
-            await self._look_up(client)
-            interval = await self._subscribe(client, deliver)
+            await self._look_up(client, self._readings.signals)
+            subscription, interval = await self._subscribe(client, deliver)
+            retry, pause = time.monotonic() + FIRST_RETRY, FIRST_RETRY
             limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
             while True:
                 await asyncio.sleep(0.1 * limit)
@@ -287,6 +292,10 @@ class OpcuaSubscriber(ThreadedDriver):
                     raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
                 if now >= self._clocks_due:
                     await self._compare_clocks(client)
+                if now >= retry:
+                    found = await self._ask_again(client, subscription)
+                    pause = FIRST_RETRY if found else min(2.0 * pause, LAST_RETRY)
+                    retry = now + pause
 
     async def _note_loss(self, error: Exception) -> None:
         """Take the cause from the library, which after this presents a lost connection as an ended subscription."""
@@ -296,10 +305,10 @@ class OpcuaSubscriber(ThreadedDriver):
         await exchange(client, self._readings.clock)
         self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
 
-    async def _look_up(self, client: Client) -> None:
+    async def _look_up(self, client: Client, nodes: Sequence[NodeSignal]) -> None:
         """Ask for the variables, and for the units that the machine file leaves out."""
         spaces = await namespaces(client)
-        for node in self._readings.signals:
+        for node in nodes:
             node.fault = ""
             try:
                 placed = place(node.source.node, spaces, node.namespace)
@@ -316,8 +325,24 @@ class OpcuaSubscriber(ThreadedDriver):
             except (ua.UaStatusCodeError, ValueError) as error:
                 node.conversion, node.fault = None, f"{node.source.node}: {error}; set 'unit' beside it"
 
-    async def _subscribe(self, client: Client, deliver: Deliver) -> float:
-        """Subscribe to all variables; return the time (s) between two messages."""
+    async def _ask_again(self, client: Client, subscription: int) -> bool:
+        """Subscribe to the variables that the server lacked or removed; return whether one of them is there."""
+        missing = [index for index, node in enumerate(self._readings.signals) if node.fault]
+        if not missing:
+            return False
+        nodes = [self._readings.signals[index] for index in missing]
+        gone = [node.item for node in nodes if node.item is not None]
+        if gone:
+            asked = ua.DeleteMonitoredItemsParameters(SubscriptionId=subscription, MonitoredItemIds=gone)
+            await client.uaclient.session.delete_monitored_items(asked)
+        await self._look_up(client, nodes)
+        await self._monitor(
+            client, subscription, [index for index in missing if not self._readings.signals[index].fault]
+        )
+        return not all(node.fault for node in nodes)
+
+    async def _subscribe(self, client: Client, deliver: Deliver) -> tuple[int, float]:
+        """Subscribe to all variables; return the subscription and the time (s) between two messages."""
         readings, session = self._readings, client.uaclient.session
         asked = ua.CreateSubscriptionParameters(
             RequestedPublishingInterval=self._options.interval * 1e3,
@@ -329,14 +354,21 @@ class OpcuaSubscriber(ThreadedDriver):
         result = await session.create_subscription(asked, lambda message: self._guarded_take(message, deliver))
         interval = self._interval = 1e-3 * float(result.RevisedPublishingInterval)
         readings.begin(interval)
-        wanted = [index for index, node in enumerate(readings.signals) if not node.fault]
-        refused = await self._monitor(client, result.SubscriptionId, wanted, by_stamp=True)
-        await self._monitor(client, result.SubscriptionId, refused, by_stamp=False)
+        for node in readings.signals:
+            node.item = None
+        await self._monitor(
+            client, result.SubscriptionId, [index for index, node in enumerate(readings.signals) if not node.fault]
+        )
         if all(node.fault for node in readings.signals):
             raise RefusedError(readings.signals[0].fault)
-        return interval
+        return int(result.SubscriptionId), interval
 
-    async def _monitor(self, client: Client, subscription: int, indices: Sequence[int], *, by_stamp: bool) -> list[int]:
+    async def _monitor(self, client: Client, subscription: int, indices: Sequence[int]) -> None:
+        """Add the signals ``indices`` to the subscription, without a filter where the server refuses it."""
+        refused = await self._add(client, subscription, indices, by_stamp=True)
+        await self._add(client, subscription, refused, by_stamp=False)
+
+    async def _add(self, client: Client, subscription: int, indices: Sequence[int], *, by_stamp: bool) -> list[int]:
         """Add the signals ``indices`` to the subscription; return those whose filter the server refuses."""
         if not indices:
             return []
@@ -348,10 +380,12 @@ class OpcuaSubscriber(ThreadedDriver):
         results = await client.uaclient.session.create_monitored_items(asked)
         refused = []
         for index, node, result in zip(indices, nodes, results, strict=True):
+            node.item = result.MonitoredItemId if result.StatusCode.is_good() else None
             if by_stamp and "Filter" in result.StatusCode.name:
                 refused.append(index)
             elif not result.StatusCode.is_good():
-                node.fault = f"{node.source.node}: {result.StatusCode.name}: 'otolith probe opcua' lists the variables"
+                hint = "'otolith probe opcua' lists the variables"
+                node.fault = f"{node.source.node}: {result.StatusCode.name}: {hint}; it is asked for again"
             elif result.RevisedSamplingInterval > 1.5e3 * self._period:
                 rates = f"every {result.RevisedSamplingInterval:g} ms instead of {self._period * 1e3:g} ms"
                 self._slow = f"by its own account the server samples {node.signal.name} {rates}"
@@ -390,7 +424,14 @@ class OpcuaSubscriber(ThreadedDriver):
                 values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
         if not readings.clock.arrival(unix_time(message.PublishTime), now):  # the server's clock was set
             self._clocks_due = now
+        for index, value in values:
+            if value.StatusCode is not None and value.StatusCode.value in GONE:
+                node = readings.signals[index]
+                node.fault = f"{node.source.node}: the server has removed it; it is asked for again"
         samples = readings.take(message, values, now)
-        if samples and not self._stop.is_set():
+        if self._stop.is_set():
+            return
+        if values:  # also unusable ones: what is wrong with them is a warning of a link that is up
             self._connection.come_up("sends values")
+        if samples:
             deliver(samples)

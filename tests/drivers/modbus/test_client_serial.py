@@ -29,6 +29,7 @@ class Device:
         self.delay: Callable[[int], float | None] = lambda number: 0.0
         self.requests = 0
         self.echo: Callable[[int], bool] = lambda number: False
+        self.corrupt: Callable[[bytes], bytes] = lambda reply: reply
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="device")
         self._thread.start()
@@ -50,16 +51,20 @@ class Device:
                 if self.echo(self.requests):
                     replies.append((time.monotonic(), request))
                 if (delay := self.delay(self.requests)) is not None:
-                    replies.append((time.monotonic() + delay, reply_to(request)))
+                    replies.append((time.monotonic() + delay, self.corrupt(reply_to(request))))
             for due in [reply for reply in replies if reply[0] <= time.monotonic()]:
                 os.write(self.master, due[1])
                 replies.remove(due)
 
 
+def with_checksum(body: bytes) -> bytes:
+    return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
+
+
 def reply_to(request: bytes) -> bytes:
     number, function, address, count = struct.unpack(">BBHH", request[:6])
     body = bytes([number, function, 2 * count]) + struct.pack(f">{count}H", *range(address, address + count))
-    return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
+    return with_checksum(body)
 
 
 @pytest.fixture
@@ -105,6 +110,68 @@ def test_echo_of_the_request_is_no_answer(device: Device) -> None:
         driver.close()
     assert len(samples) > 50
     assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
+
+
+@pytest.mark.parametrize(
+    "around",
+    [
+        (b"\0", b""),
+        (b"\xff\xff", b""),
+        (b"\x01", b""),
+        (b"\x01\x03", b"\x01\x03"),
+        (b"", b"\0"),
+        (with_checksum(bytes([7, 3, 2, 0, 5])), b""),
+        (bytes(range(40)), b"\xff"),
+    ],
+)
+def test_the_answer_is_found_among_other_bytes(device: Device, around: tuple[bytes, bytes]) -> None:
+    """An RS-485 adapter adds a byte when its driver is switched, and other devices answer others; no reading is lost.
+
+    Without and with the echo of the request, before which such a byte may come, too.
+    """
+    device.corrupt = lambda reply: reply.join(around)
+    device.echo = lambda number: number % 2 == 0
+    driver, samples = poller(device), list[Sample]()
+    driver.open(samples.extend)
+    try:
+        wait_for(lambda: device.requests > 50)
+        assert driver.link().up
+        assert not driver.link().warnings
+    finally:
+        driver.close()
+    assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "said"),
+    [
+        (lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), "wrong checksum"),
+        (lambda reply: reply[:-3], "cut"),
+        (lambda _: with_checksum(bytes([7, 3, 2, 0, 5])), "device 7 instead of 1"),
+        (lambda _: with_checksum(bytes([1, 3, 4, 0, 5, 0, 5])), "4 bytes instead of 2"),
+        (lambda _: b"\x93\x11\x80\x80", "are baudrate, parity and stop_bits"),
+        (lambda _: b"", "no answer within"),
+    ],
+)
+def test_what_is_no_answer_has_a_named_cause(device: Device, corrupt: Callable[[bytes], bytes], said: str) -> None:
+    device.corrupt = corrupt
+    driver, samples = poller(device), list[Sample]()
+    driver.open(samples.extend)
+    try:
+        wait_for(lambda: any(said in line for line in driver.link().warnings))
+    finally:
+        driver.close()
+    assert samples == []
+
+
+def test_an_echo_without_an_answer_is_named(device: Device) -> None:
+    device.echo, device.delay = lambda number: True, lambda number: None
+    driver = poller(device)
+    driver.open(lambda _: None)
+    try:
+        wait_for(lambda: any("only the echo" in line for line in driver.link().warnings))
+    finally:
+        driver.close()
 
 
 def test_silent_line_is_reopened(device: Device) -> None:

@@ -108,6 +108,12 @@ QUIRKS = {
     "transaction id 0, declared": Quirk(
         lambda: Behaviour(WORDS, corrupt=lambda reply: b"\0\0" + reply[2:]), 0.05, options={"reply_transaction": 0},
     ),
+    "length too small": Quirk(
+        lambda: Behaviour(WORDS, corrupt=lambda reply: reply[:4] + (len(reply) - 7).to_bytes(2) + reply[6:]), 0.05,
+    ),
+    "length too large": Quirk(
+        lambda: Behaviour(WORDS, corrupt=lambda reply: reply[:4] + (len(reply) - 5).to_bytes(2) + reply[6:]), 0.05,
+    ),
     "late": Quirk(lambda: Behaviour(WORDS, corrupt=now_and_then(late)), 0.5),
     "duplicate": Quirk(lambda: Behaviour(WORDS, corrupt=now_and_then(lambda reply: 2 * reply)), 0.05),
     "torn 32-bit": Quirk(

@@ -88,7 +88,10 @@ def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
 def test_stamps_of_a_clock_an_hour_ahead_are_refused_and_those_of_the_server_used(port: int, tmp_path: Path) -> None:
     with opened(port, tmp_path, nodes={"i": "ns=2;s=ahead"}) as (driver, samples):
         wait_for(lambda: driver.counters().bad > 10)
-        assert "known within" in driver.link().plan
+        link = driver.link()
+        assert link.up, "the server does send, and the warning says what is wrong with it"
+        assert_each_says(link.warnings, ("i:", "3600.0 s after", 'stamps = "server"'))
+        assert "known within" in link.plan
         assert samples == []
     with opened(port, tmp_path, nodes={"i": "ns=2;s=ahead"}, stamps="server") as (driver, samples):
         wait_for(lambda: len(samples) > 10)
@@ -122,6 +125,33 @@ def test_an_unknown_node_and_a_missing_unit_are_named(port: int, tmp_path: Path)
     assert {sample.signal for sample in samples} == {"omega"}
     with opened(port, tmp_path, nodes={"i": "ns=0;i=2267"}) as (driver, _):
         wait_for(lambda: "set 'unit'" in driver.link().reason)
+
+
+def test_a_variable_that_appears_later_or_is_made_anew_is_subscribed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opcua, "FIRST_RETRY", 0.2)
+    monkeypatch.setattr(opcua, "LAST_RETRY", 0.2)
+    port = free_port(socket.SOCK_STREAM)
+
+    def of_late(samples: list[Sample]) -> int:
+        return sum(sample.signal == "omega" for sample in samples)
+
+    def is_missing(driver: opcua.OpcuaSubscriber) -> bool:
+        return any("ns=2;s=omega" in line and "asked for again" in line for line in driver.link().warnings)
+
+    with opcua_server(port, VALUES, "--late", "omega") as server, opened(port, tmp_path) as (driver, samples):
+        for _ in range(2):
+            before = of_late(samples)
+            wait_for(lambda: is_missing(driver))
+            server.send_signal(signal.SIGUSR1)
+            wait_for(lambda: of_late(samples) > before + 50)  # noqa: B023 - called in this round
+            assert not is_missing(driver)
+            server.send_signal(signal.SIGUSR1)
+        counters = driver.counters()
+    times = [sample.time for sample in samples if sample.signal == "omega"]
+    assert times == sorted(set(times)), "it is subscribed once"
+    assert counters.reconnects == 0
 
 
 def test_a_namespace_that_the_server_lacks_costs_only_its_signal(port: int, tmp_path: Path) -> None:
