@@ -218,7 +218,7 @@ class ModbusPoller(ThreadedDriver):
         for signal in sorted(request.signals, key=lambda signal: signal.is_sampled):  # decimals first
             part = registers[signal.address - request.address : signal.end - request.address]
             if not signal.is_sampled:
-                self._decimals[signal.place] = signal.number(part)
+                self._decimals[signal.place] = signal.value(part)
                 continue
             self._order.take(signal, part)
             decimals = 0.0 if signal.decimals is None else self._decimals.get(signal.decimals.place, math.nan)

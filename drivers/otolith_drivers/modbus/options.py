@@ -24,6 +24,7 @@ HIGHEST_ADDRESS = 65535
 REQUEST_BYTES, REPLY_BYTES = 8, 5  # of RTU; the reply has two more for each register
 SILENT_CHARACTERS = 3.5  # between frames (Modbus over Serial Line V1.02, section 2.5.1.1)
 
+MAX_EXPONENT = 10  # magnitude of an exponent in a register: that of SunSpec's scale factors
 MAX_DECIMALS = 9  # digits behind the point; more are no decimals register
 
 TypeName = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
@@ -152,13 +153,15 @@ class ModbusSource(ScaledSource):
     trusted: bool = False  # Whether to skip the plausibility check of the byte order
     decimals: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1)] | None = None
     """Register with the number of decimals: the number is divided by 10 to its power."""
+    exponent: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1)] | None = None
+    """Register with a signed exponent, as SunSpec's scale factors: the number is multiplied by 10 to its power."""
 
     @model_validator(mode="before")
     @classmethod
     def _give_a_bit_its_type(cls, written: object) -> object:
         if not isinstance(written, dict) or written.get("table") not in tuple(BIT_TABLES):
             return written
-        if foreign := [key for key in ("type", "order", "bits", "decimals") if key in written]:
+        if foreign := [key for key in ("type", "order", "bits", "decimals", "exponent") if key in written]:
             raise ValueError(f"{foreign[0]!r} is of registers: a {written['table']} is 0 or 1")
         return written | {"type": "uint16"}
 
@@ -166,6 +169,8 @@ class ModbusSource(ScaledSource):
     def _has_the_bits(self) -> Self:
         if self.bits is not None:
             bit_reader(self.bits, self.type)
+        if self.decimals is not None and self.exponent is not None:
+            raise ValueError("'decimals' and 'exponent' both move the point: give the one that the manual names")
         return self
 
 
@@ -183,7 +188,7 @@ class RegisterSignal:
     source: ModbusSource
     number: Callable[[Sequence[int]], float]  # From registers to the number in them
     conversion: Conversion
-    decimals: "RegisterSignal | None" = None  # the register with their number
+    decimals: "RegisterSignal | None" = None  # the register with their number, or with minus their number
     is_sampled: bool = True  # False for a register of decimals, which is no signal of its own
 
     @property
@@ -203,21 +208,29 @@ class RegisterSignal:
 
     def value(self, registers: Sequence[int], decimals: float = 0.0) -> float:
         """Return the value in the target unit; NaN if the number is not finite or out of range."""
-        if not 0.0 <= decimals <= MAX_DECIMALS:
+        if self._wrong_point(decimals):
             return math.nan
         return self.conversion.value(self.number(registers) / 10.0**decimals)
 
     def why_no_value(self, registers: Sequence[int], decimals: float) -> str:
         """Return why :meth:`value` is NaN, with value and range."""
-        if not 0.0 <= decimals <= MAX_DECIMALS:
-            return f"has {decimals:g} decimals, not 0 to {MAX_DECIMALS:g}"
-        return self.conversion.why_no_value(self.number(registers) / 10.0**decimals)
+        return self._wrong_point(decimals) or self.conversion.why_no_value(self.number(registers) / 10.0**decimals)
+
+    def _wrong_point(self, decimals: float) -> str:
+        """Return why the number of ``decimals`` cannot be one; empty if it can."""
+        if self.source.exponent is not None:
+            is_possible = -MAX_EXPONENT <= decimals <= MAX_EXPONENT
+            return "" if is_possible else f"has the exponent {-decimals:g}, not -{MAX_EXPONENT} to {MAX_EXPONENT}"
+        return "" if 0.0 <= decimals <= MAX_DECIMALS else f"has {decimals:g} decimals, not 0 to {MAX_DECIMALS:g}"
 
     def describe(self) -> str:
         """Return device, register, type, order and bit field in words."""
         order = f" {self.order}" if self.count > 1 else ""
         field = f" bits {self.source.bits}" if self.source.bits else ""
-        point = f" with the decimals of register {self.source.decimals}" if self.decimals is not None else ""
+        point = f" with the decimals of register {self.source.decimals}" if self.source.decimals is not None else ""
+        point = (
+            f" times 10 to the power in register {self.source.exponent}" if self.source.exponent is not None else point
+        )
         if self.table in BIT_TABLES:
             return f"device {self.device}, {BIT_TABLES[self.table]} {self.source.register_}"
         return f"device {self.device}, {self.table} register {self.source.register_}, {self.kind}{order}{field}{point}"
@@ -241,9 +254,10 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         raise ConfigurationError(text, key)
     order = source.order or options.order
     decimals = None
-    if source.decimals is not None:
-        keys = {"register": source.decimals, "type": "uint16", "unit": "1"}
-        hidden = ModbusSource.model_validate(keys | {"table": source.table, "device": source.device})
+    if (place := source.exponent if source.decimals is None else source.decimals) is not None:
+        kind, scale = ("uint16", 1.0) if source.exponent is None else ("int16", -1.0)
+        keys = {"register": place, "type": kind, "scale": scale, "unit": "1", "table": source.table}
+        hidden = ModbusSource.model_validate(keys | {"device": source.device})
         decimals = replace(register_signal(Signal(f"{signal.name}.decimals", "1", hidden), options), is_sampled=False)
     return RegisterSignal(
         name=signal.name,

@@ -200,7 +200,7 @@ def test_coils_and_discrete_inputs_are_signals(function: int) -> None:
     assert "function codes 1 to 4" in listener.driver.describe()[0]
 
 
-@pytest.mark.parametrize("key", [{"type": "int16"}, {"order": "ABCD"}, {"bits": "3"}, {"decimals": 4}])
+@pytest.mark.parametrize("key", [{"type": "int16"}, {"order": "ABCD"}, {"bits": "3"}, {"decimals": 4}, {"exponent": 4}])
 def test_a_coil_takes_no_keys_of_registers(key: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match="is of registers: a coil is 0 or 1"):
         Source.model_validate({"register": 1, "table": "coil", "unit": "1"} | key)
@@ -220,6 +220,26 @@ def test_a_decimals_register_moves_the_point(place: int) -> None:
         wait_for(lambda: listener.driver.counters().bad > counters.bad + 3)
     assert {sample.value for sample in listener.of("s0") if sample.value == sample.value} == {24.15, 2.415}
     assert "with the decimals of register" in listener.driver.describe()[1]
+
+
+@pytest.mark.parametrize("place", [4, 60])
+def test_a_signed_exponent_in_a_register_moves_the_point_both_ways(place: int) -> None:
+    """SunSpec's scale factors; 0x8000 in one is "not implemented", so its number is no reading."""
+    behaviour, port = Behaviour({0: 2415, place: 0xFFFE}), free_port(socket.SOCK_STREAM)
+    sources = [source(register=0, type="int16", exponent=place)]
+    with odd_server(behaviour, port), Listener(poller(port, sources, 0.02)) as listener:
+        wait_for(lambda: any(sample.value == sample.value for sample in listener.of("s0")))
+        behaviour.words[place] = 2
+        wait_for(lambda: listener.of("s0")[-1].value == pytest.approx(241500.0))
+        behaviour.words[place] = 0x8000
+        listener.wait(lambda link: any("exponent -32768" in line for line in link.warnings))
+    values = {sample.value for sample in listener.of("s0") if sample.value == sample.value}
+    assert sorted(values) == pytest.approx([24.15, 241500.0])
+
+
+def test_decimals_and_exponent_exclude_each_other() -> None:
+    with pytest.raises(ValidationError, match="'decimals' and 'exponent'"):
+        source(register=0, type="int16", decimals=4, exponent=4)
 
 
 def test_the_reason_of_a_link_that_is_down_is_what_the_device_answers() -> None:
