@@ -19,6 +19,7 @@ from otolith_drivers.base import Counters, Sample, Setup, Signal
 from otolith_drivers.canbus.canopen import CanopenDrive, FrameHandler, NodeMonitor
 from otolith_drivers.canbus.database import STANDARD_LIMIT, CanDatabase, load_database
 from otolith_drivers.canbus.j1939 import (
+    ExactIdentifiers,
     ParameterGroups,
     fault_of,
     highest_reading,
@@ -157,15 +158,15 @@ class MessageReader:
         self.received += len(samples)
         return samples
 
-    def warnings(self, now: float, begun: float, *, unused: bool = True) -> list[str]:
+    def warnings(self, now: float, begun: float, *, unused: bool = True, hint: str = "") -> list[str]:
         """What is wrong at ``now`` (s), a line each; listening began at ``begun`` (s).
 
-        With ``unused`` also what came lately and could not be used.
+        With ``unused`` also what came lately and could not be used. ``hint`` is why nothing may come.
         """
         if self.periods.last is None and not self._rejections:
             waited = now - begun
             limit = max(MIN_WAIT, WAIT_PERIODS * (self._declared_period or self._database_period))
-            return [f"{self.title} has not come once in {waited:.1f} s"] if waited > limit else []
+            return [f"{self.title} has not come once in {waited:.1f} s{hint}"] if waited > limit else []
         rejections = self._rejections.values() if unused else ()
         lines = [line for rejection in rejections for line in rejection.warnings(now, self.title)]
         if self._counter is not None and self._counter.is_random:
@@ -310,12 +311,14 @@ class FrameDecoder:
         nodes: Sequence[NodeMonitor] = (),
         warnings: Sequence[str] = (),
         groups: ParameterGroups | None = None,
+        exact: ExactIdentifiers | None = None,
     ) -> None:
-        """``groups`` are the keys of ``readers`` whose frames may come from any node of J1939."""
+        """``groups`` are the keys of ``readers`` whose frames may come from any node of J1939, ``exact`` the others."""
         self.faults = BusFaults()  # What error frames report
         self.configuration_warnings = tuple(warnings)  # What is wrong with the files that describe the frames
         self._readers = dict(readers)
         self._groups = groups or None
+        self._exact = exact
         self._nodes = tuple(nodes)
         self._handlers: dict[int, FrameHandler] = {
             key: handler for node in nodes for key, handler in node.handlers.items()
@@ -353,6 +356,8 @@ class FrameDecoder:
                     return NO_SAMPLES
                 key, data, time = self._groups.key(message), message.data, message.time
             reader = self._readers.get(key)
+            if reader is None:
+                self.note_other(frame.arbitration_id, extended=key >= EXTENDED)
             return reader.take(data, time) if reader is not None else NO_SAMPLES
         except Exception as error:  # noqa: BLE001 - no frame may end the thread
             written, identifier = getattr(frame, "data", None), getattr(frame, "arbitration_id", None)
@@ -360,6 +365,11 @@ class FrameDecoder:
             if isinstance(written, bytes | bytearray) and isinstance(identifier, int):  # else the interface is at fault
                 self._own_faults.note(error, f"decoding frame 0x{identifier:X} with data {written.hex(' ')}", time)
             return NO_SAMPLES
+
+    def note_other(self, identifier: int, *, extended: bool) -> None:
+        """Note a frame that is not decoded: it may be that of a message whose source has another address."""
+        if extended and self._exact is not None:
+            self._exact.note(identifier)
 
     @property
     def counters(self) -> Counters:
@@ -383,11 +393,20 @@ class FrameDecoder:
             self._begun = now
         with self._lock:
             lines = self.faults.warnings(now) + (self._groups.warnings(now) if self._groups is not None else [])
-            for reader in self._readers.values():
-                lines += reader.warnings(now, self._begun, unused=unused)
+            for key, reader in self._readers.items():
+                lines += reader.warnings(now, self._begun, unused=unused, hint=self._other_sources(key))
             for node in self._nodes:
                 lines += node.warnings(now)
         return lines
+
+    def _other_sources(self, key: int) -> str:
+        sources = (self._groups, self._exact)
+        return "".join(known.other_sources(key) for known in sources if known is not None)
+
+    def other_sources(self) -> str:
+        """From which other addresses of J1939 the messages came, in words; empty without any."""
+        with self._lock:
+            return "".join(map(self._other_sources, self._readers))
 
     def defect(self, now: float) -> str:
         """What this program did wrong lately at ``now`` (s); empty if nothing."""
@@ -421,8 +440,8 @@ class FrameDecoder:
             (identifier, EXTENDED - 1 if extended else STANDARD_LIMIT, extended)
             for identifier, extended in self.identifiers()
         ]
-        groups = self._groups.filters() if self._groups is not None else ()
-        return exact + [(identifier, mask, True) for identifier, mask in groups]
+        known = [each.filters() for each in (self._groups, self._exact) if each is not None]
+        return exact + [(identifier, mask, True) for filters in known for identifier, mask in filters]
 
     def wants(self, identifier: int, *, extended: bool) -> bool:
         """Whether frames of this arbitration ID are decoded."""
@@ -464,7 +483,9 @@ def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
     if len(warnings) > MAX_WARNINGS:
         warnings = [*warnings[:MAX_WARNINGS], f"... and {len(warnings) - MAX_WARNINGS} more"]
     groups = ParameterGroups(open_sources, options.source_address)
-    return FrameDecoder(readers, [drive.monitor for drive in drives.values()], warnings, groups)
+    one_source = [row for row in described.items() if row[1].is_extended_frame and row not in open_sources]
+    monitors = [drive.monitor for drive in drives.values()]
+    return FrameDecoder(readers, monitors, warnings, groups, ExactIdentifiers(one_source) if one_source else None)
 
 
 @dataclass(slots=True)

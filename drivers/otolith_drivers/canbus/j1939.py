@@ -27,6 +27,7 @@ ERROR_BYTE, NOT_AVAILABLE_BYTE = 0xFE, 0xFF
 MANAGEMENT, DATA = 0xEC00, 0xEB00  # the parameter groups of the protocol
 RTS, CTS, END, BAM, ABORT = 16, 17, 19, 32, 255  # what a frame of connection management is, by its first byte
 PACKET_BYTES, MIN_BYTES, MAX_BYTES = 7, 9, 1785
+MAX_SHOWN = 5  # addresses in a line
 MAX_PAUSE = 1.25  # s between two frames of a transfer: the longest timeout of the standard (T2, T3)
 
 
@@ -219,9 +220,9 @@ class ParameterGroups:
         return group.key
 
     def filters(self) -> Iterator[tuple[int, int]]:
-        """Yield identifier and mask of each group."""
-        for number, group in self._groups.items():
-            yield filter_of(number, group.declared)
+        """Yield identifier and mask of each group, from any source, so that one that is not declared is named."""
+        for number in self._groups:
+            yield filter_of(number, None)
         if self.assembler is not None:
             yield from (filter_of(number, None) for number in (MANAGEMENT, DATA))
 
@@ -229,6 +230,15 @@ class ParameterGroups:
         """Whether a frame belongs to a group, from whatever source."""
         group = group_of(identifier)
         return group in self._groups or (self.assembler is not None and group in (MANAGEMENT, DATA))
+
+    def other_sources(self, key: int) -> str:
+        """Return from which addresses the group of a reader came that are not read, in words; empty without any."""
+        found = [(number, group) for number, group in self._groups.items() if group.key == key and group.others]
+        return "".join(
+            f"; {_from_addresses(number, group.others)} instead of 0x{group.declared or 0:02X}: "
+            f"is source_address in [driver] right, or the identifier in the database?"
+            for number, group in found
+        )
 
     def warnings(self, now: float) -> list[str]:
         """Return a line for each group that several nodes send although none is declared, and for lost packets."""
@@ -239,3 +249,39 @@ class ParameterGroups:
             for number, group in self._groups.items()
             if group.others and group.source is not None and group.declared is None
         ]
+
+
+class ExactIdentifiers:
+    """Messages that are read from one identifier, and the other addresses from which their parameter groups came."""
+
+    def __init__(self, messages: Sequence[tuple[int, Message]]) -> None:
+        """``messages`` have 29 bits and readers' keys."""
+        self._marked = [message.frame_id for _, message in messages if message.protocol == "j1939"]
+        self._groups = {key: group_of(message.frame_id) for key, message in messages}
+        self._others: dict[int, set[int]] = {group: set() for group in self._groups.values()}
+
+    def note(self, identifier: int) -> None:
+        """Note a frame of 29 bits that no reader takes."""
+        if (others := self._others.get(group_of(identifier))) is not None:
+            others.add(identifier & ADDRESS_MASK)
+
+    def filters(self) -> Iterator[tuple[int, int]]:
+        """Yield identifier and mask of the groups that the database marks as J1939, from any source."""
+        yield from (filter_of(group_of(identifier), None) for identifier in self._marked)
+
+    def other_sources(self, key: int) -> str:
+        """Return from which other addresses the group of a reader came, in words; empty without any."""
+        group = self._groups.get(key)
+        if group is None or not self._others[group]:
+            return ""
+        return (
+            f"; {_from_addresses(group, self._others[group])} instead of 0x{key & ADDRESS_MASK:02X}: "
+            "if these are its readings, write 0xFE as the last byte of its identifier in the database, "
+            "and the address as source_address in [driver]"
+        )
+
+
+def _from_addresses(group: int, addresses: Collection[int]) -> str:
+    shown = sorted(addresses)[:MAX_SHOWN]
+    more = f" and {len(addresses) - len(shown)} more" if len(addresses) > len(shown) else ""
+    return f"PGN {group} comes from address {', '.join(f'0x{address:02X}' for address in shown)}{more}"

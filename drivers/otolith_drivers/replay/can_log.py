@@ -241,6 +241,7 @@ class CanLogReader(Reader):
             is_wanted = wants(frame.arbitration_id, extended=frame.is_extended_id)
             if not is_wanted or frame.is_error_frame or frame.is_remote_frame:
                 self._others += 1
+                self._decoder.note_other(frame.arbitration_id, extended=frame.is_extended_id)
             elif samples := self._samples(place, frame):
                 chunk.add(place, samples, self._unreadable + self._undecoded)
             if len(chunk) >= CHUNK:
@@ -287,7 +288,7 @@ class CanLogReader(Reader):
         if not self._frames:
             return "".join([f": no frames{hint}", *(f": {line}" for line in self._cut_off())])
         wanted = ", ".join(f"0x{identifier:X}" for identifier, _ in self._decoder.identifiers())
-        return f": none of its {self._frames} frames is one of {wanted}"
+        return f": none of its {self._frames} frames is one of {wanted}{self._decoder.other_sources()}"
 
     def describe(self) -> list[str]:
         return self._decoder.describe()

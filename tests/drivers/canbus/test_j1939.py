@@ -10,8 +10,10 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.driver import Options, Source
 from otolith_drivers.canbus.j1939 import group_of
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.replay.can_log import open_log
 from tests.drivers.canbus.test_j1939_transport import transfer_frames
-from tests.messages import assert_each_says
+from tests.messages import assert_each_says, assert_says, raises_saying
 
 ENGINE, TORQUE, LONG, FIXED, LONG_OF_ONE = 0x0CF004FE, 0x18EF00FE, 0x18FECAFE, 0x0CF00401, 0x18FECB21
 DATABASE = f"""VERSION ""
@@ -79,6 +81,37 @@ def test_another_group_is_not_read(folder: Path, identifier: int) -> None:
     assert sent(decoder(folder), identifier, engine(8000)) == {}
 
 
+@pytest.mark.parametrize("is_marked", [False, True])
+def test_a_message_that_only_another_address_sends_is_named_with_it(folder: Path, *, is_marked: bool) -> None:
+    """Whether the machine file declares the address or the database; a message that comes has no such line."""
+    declared = decoder(folder, ("n",), source_address="0x03")
+    kinds = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+    mark = f'{kinds}BA_ "VFrameFormat" BO_ {FIXED | 1 << 31} 3;\n'
+    (folder / "j.dbc").write_text(DATABASE + mark * is_marked, encoding="utf-8")
+    signals = (Signal("n", "1", Source(signal="Other")),)
+    exact = decoder_of(Options.model_validate({"dbc": "j.dbc"}), Setup(signals, folder, 0.01))
+    for decode, own in ((declared, 0x03), (exact, 0x01)):
+        decode.begin(0.0)
+        for source in (0x17, 0x21):
+            assert sent(decode, 0x0CF00400 | source, engine(8000)) == {}
+        (line,) = decode.warnings(60.0)
+        assert_says(line, "has not come once", "PGN 61444", "0x17, 0x21", f"0x{own:02X}", "source_address")
+        assert sent(decode, 0x0CF00400 | own, engine(8000), 60.0)
+        assert not [line for line in decode.warnings(60.1) if "0x17" in line]
+    passes = [0x0CF00417 & mask == number & mask for number, mask, _ in exact.filters()]
+    assert any(passes) == is_marked, "an identifier that may be no J1939 is received alone"
+
+
+def test_a_log_of_another_address_says_which(folder: Path) -> None:
+    signals = (Signal("n", "1", Source(signal="Other")),)
+    (folder / "a.log").write_text(
+        "".join(f"({t}.0) can0 0CF00417#FFFFFFFFFFFFFFFF\n" for t in range(9)), encoding="utf-8"
+    )
+    options, setup = Options.model_validate({"dbc": "j.dbc"}), Setup(signals, folder, 0.01)
+    with open_log(folder / "a.log", setup, options) as log, raises_saying(ConfigurationError, "PGN 61444", "0x17"):
+        list(log.chunks())
+
+
 def test_a_standard_frame_with_the_same_low_bits_is_not_read(folder: Path) -> None:
     decode = decoder(folder)
     assert decode.decode(can.Message(arbitration_id=0x4FE, data=engine(8000), is_extended_id=False), 0.0) == []
@@ -130,7 +163,8 @@ def test_the_filters_of_the_kernel_pass_all_sources_of_a_group_and_nothing_else(
         assert passed(either, identifier) == either.wants(identifier, extended=True) == wanted
     one = decoder(folder, ("n",), source_address=3)
     assert passed(one, 0x18F00403)
-    assert not passed(one, 0x18F00404)
+    assert passed(one, 0x18F00404), "a source that is not declared is named"
+    assert not passed(one, 0x18F00503)
 
 
 def faults_decoder(folder: Path, **keys: object) -> FrameDecoder:
