@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -183,6 +184,8 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
               help="Write this new HTML page, as 'otolith report' does.")  # fmt: skip
 @click.option("--history", "folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
               help="Keep the history of the reports in this folder.")  # fmt: skip
+@click.option("--state", type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="DIR",
+              help="Use the decisions of this state directory, as a copy of that of another computer.")  # fmt: skip
 @click.option("--real-time", is_flag=True, help="Wait for the end of each window, as in operation.")
 @click.option("--timing", is_flag=True, help="Add computing times, which differ from run to run.")
 def replay(
@@ -192,6 +195,7 @@ def replay(
     recording: Path | None,
     page: Path | None,
     folder: Path | None,
+    state: Path | None,
     real_time: bool,
     timing: bool,
 ) -> int:
@@ -215,8 +219,8 @@ def replay(
     from otolith.cli.replay import replay
 
     stop = StopSignal()
-    options = {"as_json": as_json, "real_time": real_time, "timing": timing}
-    replay(file, data, recording, stopped=stop.received, page=page, folder=folder, ending=stop.ending, **options)
+    run = partial(replay, file, data, recording, stopped=stop.received, ending=stop.ending)
+    run(page=page, folder=folder, state=state, as_json=as_json, real_time=real_time, timing=timing)
     return stop.code()
 
 

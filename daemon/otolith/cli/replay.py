@@ -25,8 +25,8 @@ from otolith.health.times import clock_in, in_local_time
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
-from otolith.storage.state_store import store_of
-from otolith_drivers.errors import OtolithError, counted
+from otolith.storage.state_store import COMPONENTS, store_of
+from otolith_drivers.errors import ConfigurationError, OtolithError, counted
 from otolith_drivers.user_dirs import writable
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
@@ -128,12 +128,14 @@ def replay(
     timing: bool = False,
     page: Path | None = None,
     folder: Path | None = None,
+    state: Path | None = None,
     ending: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
     Each file of ``data`` is a recording of its own. With ``timing`` reports have computing times, which differ from run
-    to run. The history of the reports is kept in ``folder``, and drawn as the new HTML file ``page``. ``ending`` breaks
+    to run. The history of the reports is kept in ``folder``, and drawn as the new HTML file ``page``. The operator's
+    decisions are those in the state directory ``state``, or of this user without one, and are named. ``ending`` breaks
     off, in its block, what takes too long after a signal.
 
     Raises:
@@ -150,7 +152,7 @@ def replay(
                 _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
-        run.state = _with_decisions(machine, run.state)
+        run.state = _with_decisions(machine, run.state, state)
         with (
             replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
             _history(machine, run, data, page, folder) as keep,
@@ -204,11 +206,20 @@ def _history(
             write_page(page, page_of(history.reader, *history.span))
 
 
-def _with_decisions(machine: LoadedMachine, state: AdaptationState) -> AdaptationState:
-    """Return the initial state with the components that the operator approved, and without those rejected."""
-    store = store_of(machine)
+def _with_decisions(machine: LoadedMachine, state: AdaptationState, directory: Path | None) -> AdaptationState:
+    """Return the initial state with the components that the operator approved, and without those rejected.
+
+    They change the reports, so standard error tells which file they are from.
+    """
+    if directory is not None and not (directory / COMPONENTS).is_dir():
+        raise ConfigurationError(f"{directory}: no state directory: it has no folder {COMPONENTS!r}")
+    store = store_of(machine, directory)
     decisions = store.decisions()
     approved = [record for record in store.components() if record.adopted.component.key in decisions.approved]
+    chosen = {"approved": sorted(record.adopted.component.key for record in approved),
+              "rejected": sorted(decisions.rejected)}  # fmt: skip
+    if told := "; ".join(f"{name}: {', '.join(keys)}" for name, keys in chosen.items() if keys):
+        echo(f"{store.decisions_path}: the replay uses these decisions: {told}", err=True)
     state = restore_components(state, tuple(approved))
     return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, RecordingStatistics, median_step
-from otolith.acquisition.quality import time_text
+from otolith.acquisition.quality import is_of_calendar, time_text
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
@@ -140,6 +140,52 @@ class RealTimePacer:
             time.sleep(min(left, MAX_SLEEP))
 
 
+class FileTimes:
+    """Compares the times of files that are replayed one after the other."""
+
+    def __init__(self, gap: float) -> None:
+        """``gap`` is the time without data between two files, in s, above which it is counted."""
+        self._gap = gap
+        self._path: Path | None = None
+        self._begin = self._end = -math.inf  # of the present file, s
+        self._gaps = self._overlaps = 0
+        self._longest, self._behind_gap = 0.0, ""
+        self._first_overlap = ""
+
+    def add(self, path: Path, rows: Rows) -> bool:
+        """Note some rows of a file; return whether they are its first."""
+        begin, is_first = float(rows.times[0]), path != self._path
+        if is_first:
+            if self._path is not None:
+                self._compare(begin, path, self._path)
+            self._path, self._begin, self._end = path, begin, -math.inf
+        self._end = max(self._end, float(rows.times.max()))
+        return is_first
+
+    def _compare(self, begin: float, path: Path, before: Path) -> None:
+        """Compare the ``begin`` of a file (s) with the end of the file ``before``."""
+        if begin - self._end > self._gap:
+            self._gaps += 1
+            if begin - self._end > self._longest:
+                self._longest, self._behind_gap = begin - self._end, path.name
+        own_clock = begin <= self._begin and not is_of_calendar(begin)  # it counts from its own start
+        if begin <= self._end and not own_clock:
+            self._overlaps += 1
+            begins = f"{path.name} begins at {time_text(begin)}"
+            self._first_overlap = self._first_overlap or f"{begins}, {before.name} ends at {time_text(self._end)}"
+
+    def warnings(self) -> list[str]:
+        """Return gaps and overlaps, one sentence each."""
+        lines = []
+        if self._gaps:
+            longest = f"the longest of {self._longest:.6g} s, before {self._behind_gap}"
+            lines.append(f"times without data between two files: {self._gaps}, {longest}")
+        if self._overlaps:
+            first = f"{self._first_overlap}: give the files in the order of their times"
+            lines.append(f"files that begin before the one above ends: {self._overlaps}: {first}")
+        return lines
+
+
 class Replay:
     """One file through rings, windower and adaptation core."""
 
@@ -166,6 +212,7 @@ class Replay:
         self._wait = wait
         self._timing = timing
         self._length = window.length
+        self._files = FileTimes(window.length)
         plans = machine.plans(data.sampling)
         self._playback = Playback(plans, machine.records, window.sample_period, machine.limits, machine.observed)
         self._windows = self._windows_bad = self._missed = 0
@@ -192,12 +239,10 @@ class Replay:
     def windows(self) -> Iterator[Window]:
         """Yield the windows of the file as the daemon would cut them; raises as :meth:`reports`."""
         before, begun, rows = 0.0, 0.0, None  # the shares of the file above the next and the present chunk
-        checked: Path | None = None
         for rows in self._data.chunks():
             if self._stopped():
                 return
-            if self._data.file != checked:
-                checked = self._data.file
+            if self._files.add(self._data.file, rows):
                 self._check_times(rows)
             self.statistics.add(rows)
             begun, before = before, self._data.progress
@@ -271,7 +316,7 @@ class Replay:
         """Return what a user must know of the file before trusting the reports, one sentence each."""
         counts, unused = self._playback.counts, self._playback.unused_seconds
         lines = [f"interrupted after {self.progress:.0%} of the data"] if self._stopped() else []
-        lines += self._data.warnings()
+        lines += [*self._data.warnings(), *self._files.warnings()]
         if counts.first_late is not None:
             line, late_time, latest = counts.first_late
             first = f"the first in {self._data.place} {line}, at {time_text(late_time)} after {time_text(latest)} above"

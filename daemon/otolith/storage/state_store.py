@@ -38,6 +38,7 @@ from otolith_drivers.user_dirs import state_directory, way_out
 log = logging.getLogger(__name__)
 
 KEPT = ".kept.json"
+COMPONENTS = "components"  # the folder of the state directory with these files
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 MAX_KEPT = 8  # files that were not used and are kept under another name
 PROCESS_ID_BYTES = 20
@@ -57,7 +58,7 @@ class StateStore:
         """State that was learned from signals with another ``signal_fingerprint`` is refused."""
         self._site, self._machine, self._twin = site, machine, twin
         self._signal_fingerprint = signal_fingerprint
-        folder = folder or state_directory() / "components"
+        folder = folder or state_directory() / COMPONENTS
         self.operator = DecisionsFile(folder, site, machine)
         self.components_path, self.lock_path = self.operator.learned_path, self.operator.lock_path
         self.decisions_path = self.operator.path
@@ -375,7 +376,7 @@ class StateWriter(WriterThread):
             log.warning("%s", error)
 
 
-def store_of(machine: LoadedMachine) -> StateStore:
-    """Return the store of a machine."""
-    names = machine.file.machine
-    return StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
+def store_of(machine: LoadedMachine, state: Path | None = None) -> StateStore:
+    """Return the store of a machine in the state directory ``state``; in that of this user without one."""
+    names, folder = machine.file.machine, None if state is None else state / COMPONENTS
+    return StateStore(names.site, names.name, machine.twin, folder, signal_fingerprint=machine.signal_fingerprint)

@@ -35,6 +35,7 @@ Integers = NDArray[np.int64]
 # Seconds since 1970 reach 1e11 in the year 5138; milliseconds since 1970 passed it in 1973, so a column of them without
 # its unit is refused. Guarded by tests/golden/replays/nanoseconds.
 MAX_TIME = 1e11  # s
+MAX_LISTED = 16  # files whose rows are counted one by one in a summary
 BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is recognised
 
 # Formats by the end of the file name. The module is imported only when a file asks for it.
@@ -337,7 +338,10 @@ class JoinedReader(Reader):
         """
         super().__init__(paths[0])
         self._paths, self._open_file = tuple(paths), open_file
-        self._readers: list[Reader] = []  # Those that have been read, and the present one
+        self._reader: Reader | None = None  # The present one, from which rows come
+        self._rows = self._read = self._bad = self._lost = 0  # Rows; files that were read, and what was bad and lost
+        self._summaries: list[str] = []  # Of the files that were read, as are the warnings
+        self._warnings: list[str] = []
         self._first: Reader | None = open_file(paths[0])
         first = self._first
         self.place, self.is_table, self.sampling = f"its file's {first.place}", first.is_table, first.sampling
@@ -366,48 +370,62 @@ class JoinedReader(Reader):
     @property
     def progress(self) -> float:
         """Share of the files that was read, 0 to 1."""
-        return sum(reader.progress for reader in self._readers) / len(self._paths)
+        return (self._read + (self._reader.progress if self._reader else 0.0)) / len(self._paths)
 
     @property
     def file(self) -> Path:
-        return self._readers[-1].path if self._readers else self.path
+        return self._paths[min(self._read, len(self._paths) - 1)]
 
     @property
     def bad(self) -> int:
-        return sum(reader.bad for reader in self._readers)
+        return self._bad + (self._reader.bad if self._reader else 0)
 
     @property
     def lost(self) -> int:
-        return sum(reader.lost for reader in self._readers)
+        return self._lost + (self._reader.lost if self._reader else 0)
 
     def chunks(self) -> Iterator[Rows]:
         """See :meth:`Reader.chunks`; the first row of each file but the first is marked.
 
         A recording after the first one is opened only here, so its error ends the reading.
         """
-        bad_before = 0
         for number, path in enumerate(self._paths):
             opened, self._first = self._first or self._open_file(path), None
             with opened as reader:
                 self._check(reader)
-                self._readers.append(reader)
+                self._reader = reader
                 is_first = number > 0
                 for rows in reader.chunks():
                     marks: Mask = rows.begins.copy()
                     marks[0] |= is_first
                     is_first = False
-                    yield Rows(rows.times, rows.columns, rows.lines, rows.bad + bad_before, marks)
-                bad_before += reader.bad
+                    self._rows += len(rows.times)
+                    yield Rows(rows.times, rows.columns, rows.lines, rows.bad + self._bad, marks)
+            self._finish(reader)
+
+    def _finish(self, reader: Reader) -> None:
+        """Keep of a file that was read its counts and warnings alone: there may be thousands."""
+        self._summaries.append(_summary(reader))
+        self._warnings += [f"{reader.path}: {line}" for line in reader.warnings()]
+        self._bad, self._lost, self._reader = self._bad + reader.bad, self._lost + reader.lost, None
+        self._read += 1
 
     def summary_lines(self) -> list[str]:
-        lines = [f"{reader.path.name}: {', '.join(reader.summary_lines())}" for reader in self._readers]
+        if len(self._paths) > MAX_LISTED:
+            return [f"{self._rows} rows of {self._read} of {len(self._paths)} files read", f"{self.bad} bad"]
+        lines = self._summaries + ([] if self._reader is None else [_summary(self._reader)])
         return lines + [f"{path.name}: not read" for path in self._paths[len(lines) :]]
 
     def warnings(self) -> list[str]:
-        return [f"{reader.path}: {line}" for reader in self._readers for line in reader.warnings()]
+        reader = self._reader
+        return self._warnings + ([] if reader is None else [f"{reader.path}: {line}" for line in reader.warnings()])
 
     def describe(self) -> list[str]:
         return [*self._description, f"from {len(self._paths)} files, each a recording of its own"]
+
+
+def _summary(reader: Reader) -> str:
+    return f"{reader.path.name}: {', '.join(reader.summary_lines())}"
 
 
 def costs_a_process(path: Path) -> bool:

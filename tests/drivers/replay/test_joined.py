@@ -1,5 +1,7 @@
 """Several files are replayed one after the other, each a recording of its own."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import JoinedReader, Reader
 from otolith_drivers.replay.tables import TableReader
-from tests.messages import raises_saying
+from tests.messages import assert_each_says, raises_saying
 
 PERIOD, RECORDS = 0.01, 50
 
@@ -95,3 +97,22 @@ def test_a_file_that_was_not_reached_is_named(tmp_path: Path) -> None:
         next(joined.chunks())
         assert joined.summary_lines()[1] == "b.csv: not read"
         assert joined.file == files[0]
+
+
+def test_a_file_that_was_read_is_not_kept(tmp_path: Path) -> None:
+    files = [write(tmp_path, f"{number}.csv", 10.0 * number, 5, 0.0) for number in range(50)]
+    made = list[weakref.ref[Reader]]()
+
+    def noted(path: Path) -> Reader:
+        reader = opened(path)
+        made.append(weakref.ref(reader))
+        return reader
+
+    with JoinedReader(files, noted) as joined:
+        for number, _ in enumerate(joined.chunks()):
+            if number % 20 == 0:
+                gc.collect()  # a reader and its rows refer to each other
+                assert sum(reader() is not None for reader in made) <= 2
+        assert (joined.bad, joined.progress) == (50, 1.0)
+        assert len(joined.warnings()) == 50
+        assert_each_says(joined.summary_lines(), ("250 rows", "50 of 50"), ("50 bad",))
