@@ -227,7 +227,7 @@ def test_a_replay_begins_with_a_short_preview_on_standard_error(
 def test_the_short_preview_reads_only_the_beginning(
     tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("otolith_drivers.replay.tables.CHUNK", 10_000)
+    monkeypatch.setattr("otolith_drivers.replay.table.reader.CHUNK", 10_000)
     preview = previewed(written(tmp_path, rows), max_rows=450)
     assert 450 < preview.rows < 1000
     lines = list(short_lines(preview))

@@ -25,7 +25,7 @@ from otolith.runtime.replay import Replay
 from otolith.storage.recording_files import MIN_FREE_BYTES
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay import tables as table
+from otolith_drivers.replay.table import reader as table
 from tests.cli.replays import (
     GOLDEN,
     HEADING,

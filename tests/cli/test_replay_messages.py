@@ -113,7 +113,7 @@ def test_progress_is_the_share_of_the_data_that_was_adapted_to(tmp_path: Path, s
 def test_progress_rises_steadily_in_a_file_of_many_chunks(
     tmp_path: Path, scenario: MotorScenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("otolith_drivers.replay.tables.CHUNK", 20_000)
+    monkeypatch.setattr("otolith_drivers.replay.table.reader.CHUNK", 20_000)
     once = recorded(scenario, 5)
     rows = [[f"{index * PERIOD:.3f}", *once[index % len(once)][1:]] for index in range(20 * len(once))]
     machine = load_machine(MACHINE, with_driver=False)

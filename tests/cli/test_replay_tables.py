@@ -14,7 +14,7 @@ from otolith.machine import load_machine
 from otolith.runtime.replay import Replay
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay import tables as table
+from otolith_drivers.replay.table import reader as table
 from tests.cli.replays import HEADING, MACHINE, PERIOD, Lines, recorded, reports, summed_up, values, written
 from tests.conftest import SIGNALS
 from tests.messages import assert_refuses, raises_saying

@@ -14,7 +14,7 @@ from otolith_drivers.canbus.options import MessageTable, PdoTable
 from otolith_drivers.modbus import driver as modbus
 from otolith_drivers.plant import realtime as plant
 from otolith_drivers.replay import driver as replay
-from otolith_drivers.replay import tables
+from otolith_drivers.replay.table import reader as tables
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "machine-file.md").read_text(encoding="utf-8")
 SIGNAL = "key of a signal"

@@ -43,7 +43,7 @@ CAN_LOG = "otolith_drivers.replay.can_log"
 READERS = dict.fromkeys((".asc", ".blf", ".db", ".log", ".mf4", ".trc"), CAN_LOG)
 RECORDING, RECORDING_HEAD = ".rrd", b"RRF"
 READERS[RECORDING] = "otolith_drivers.replay.recording"
-TABLE = "otolith_drivers.replay.tables"  # all other files
+TABLE = "otolith_drivers.replay.table.reader"  # all other files
 
 # Formats by the first bytes: text logs of a CAN bus, and what a refusal names.
 GZIP = ".gz"

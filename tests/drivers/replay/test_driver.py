@@ -12,7 +12,7 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay import tables as table
+from otolith_drivers.replay.table import reader as table
 from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from otolith_drivers.replay.readers import Rows
 from tests.conftest import EXAMPLES, SIGNALS

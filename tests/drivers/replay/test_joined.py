@@ -12,7 +12,7 @@ from otolith.acquisition.samples import SignalPlan
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import JoinedReader, Reader
-from otolith_drivers.replay.tables import TableReader
+from otolith_drivers.replay.table.reader import TableReader
 from tests.messages import assert_each_says, raises_saying
 
 PERIOD, RECORDS = 0.01, 50

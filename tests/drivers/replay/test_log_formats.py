@@ -22,7 +22,7 @@ from otolith_drivers.errors import ConfigurationError, installation_of
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import mf4
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
-from otolith_drivers.replay.tables import TableReader
+from otolith_drivers.replay.table.reader import TableReader
 from tests.drivers import logs
 from tests.drivers.logs import frames_of, live, opened, samples_of
 from tests.messages import assert_refuses

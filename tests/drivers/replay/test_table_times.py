@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.tables import TableSource, open_log
+from otolith_drivers.replay.table.reader import TableSource, open_log
 from tests.messages import raises_saying
 
 BEGIN = 1_714_993_372.0  # 2024-05-06 11:02:52 UTC

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay import tables
+from otolith_drivers.replay.table import reader as tables
 from otolith_drivers.replay.readers import Rows
-from otolith_drivers.replay.table_header import MAX_PREAMBLE
-from otolith_drivers.replay.tables import TableReader, TableSource
+from otolith_drivers.replay.table.header import MAX_PREAMBLE
+from otolith_drivers.replay.table.reader import TableReader, TableSource
 from tests.messages import raises_saying
 
 

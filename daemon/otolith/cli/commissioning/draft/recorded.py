@@ -10,7 +10,7 @@ from otolith.cli.commissioning.draft.offers import Offer, OfferedSource, unit_in
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.grammars.toml_lines import toml_value
 from otolith_drivers.replay.readers import holds_frames
-from otolith_drivers.replay.table_columns import offered_columns, read_columns
+from otolith_drivers.replay.table.columns import offered_columns, read_columns
 
 MAX_ROWS = 100_000  # that are looked at
 

@@ -39,7 +39,7 @@ from otolith_drivers.replay.readers import (
     Rows,
     seen,
 )
-from otolith_drivers.replay.table_header import (
+from otolith_drivers.replay.table.header import (
     BLANK,
     MAX_LINE,
     MAX_PREAMBLE,
@@ -55,7 +55,7 @@ from otolith_drivers.replay.table_header import (
     read_header,
     split_quoted,
 )
-from otolith_drivers.replay.table_times import date_of, question_of_unit, since_1970, with_dates
+from otolith_drivers.replay.table.times import date_of, question_of_unit, since_1970, with_dates
 from otolith_drivers.units import factor
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)

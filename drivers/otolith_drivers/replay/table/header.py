@@ -13,7 +13,7 @@ import numpy as np
 from otolith_drivers.config_files import Range
 from otolith_drivers.errors import ConfigurationError, nearest, shown
 from otolith_drivers.replay.readers import Array, seen
-from otolith_drivers.replay.table_times import BESIDE_NAME, contradiction, date_column, rises_evenly
+from otolith_drivers.replay.table.times import BESIDE_NAME, contradiction, date_column, rises_evenly
 from otolith_drivers.units import are_equal, factor, is_unit
 
 # Engineering choice: a thousand columns need some 20 000. Bounds the memory for a file without line ends.

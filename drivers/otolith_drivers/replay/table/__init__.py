@@ -1,0 +1,1 @@
+"""Text tables and others with a row per instant: header, times, cells."""
