@@ -26,7 +26,7 @@ SOURCES = {
     "mqtt": [DRIVERS],
     "opcua": [DRIVERS / "opcua"],
     "plant": [DRIVERS / "plant"],
-    "replay": [DRIVERS / "replay"],
+    "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
     "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],
     "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin"],

@@ -49,7 +49,7 @@ CANDUMP_LINE = re.compile(
 SQLITE_COLUMNS = ("ts", "arbitration_id", "extended", "remote", "error", "dlc", "data")
 BLF_OBJECT = struct.Struct("<4sHHLL")  # signature, size and version of the header, size, type
 
-Source = can_driver.Source  # for readers.Format
+Source, Options = can_driver.Source, can_driver.Options  # for readers.Format
 
 logging.getLogger("can.io").setLevel(logging.ERROR)  # it warns of each bad line; bad lines are counted here
 

@@ -40,10 +40,11 @@ class ReplayOptions(StrictModel):
     pace: Literal["real time", "as fast as possible"] = "real time"
     repeat: bool = False  # Start again at the end of the file; time goes on
     can: dict[str, Any] | None = None  # For a CAN log: the keys that [driver] with type = "can" would have
+    table: dict[str, Any] | None = None  # For a table: its time, and the columns of one with a value per row
 
 
 class ReplaySource(StrictModel):
-    """Keys that depend on the format: ``column``, ``unit`` and ``range`` of a table, or those of the CAN driver."""
+    """Keys that depend on the format: ``column``, ``unit`` and others of a table, or those of the CAN driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -66,9 +67,11 @@ def build(options: ReplayOptions, setup: Setup) -> "ReplayDriver":
 
 
 def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Reader]:
-    """A function that opens ``path``; raise ConfigurationError if a source or ``can`` does not fit its format."""
+    """A function that opens ``path``; raise ConfigurationError if a source or an option does not fit its format."""
     kind = format_of(path)
-    can = None
+    own = None
+    if options.table is not None and not holds_frames(path):
+        own = validated(options.table, kind.Options, ("driver", "table"))
     if holds_frames(path):
         from otolith_drivers.canbus.driver import Options as CanOptions  # noqa: PLC0415 - a table needs no python-can
 
@@ -76,7 +79,7 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
             text = "missing: the description of the frames in the log: can = { dbc = ... }"
             raise ConfigurationError(text, ("driver", "can"))
         keys = {key: value for key, value in options.can.items() if key != "type"}
-        can = validated(keys, CanOptions, ("driver", "can"))
+        own = validated(keys, CanOptions, ("driver", "can"))
     signals = tuple(
         replace(signal, source=validated(signal.source.model_dump(), kind.Source, ("signals", signal.name)))
         for signal in setup.signals
@@ -85,9 +88,9 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
 
     def open_file() -> Reader:
         try:
-            return kind.open_log(path, wanted, can)
+            return kind.open_log(path, wanted, own)
         except ConfigurationError as error:
-            if error.key[:1] != ("driver",):
+            if error.key[:1] != ("driver",) or not holds_frames(path):
                 raise
             raise ConfigurationError(str(error), ("driver", "can", *error.key[1:])) from error
 

@@ -88,7 +88,6 @@ OTHERS = {
         rb"(?i)(?>[^\n]*?\b(?:can[ _]?)?id(?:entifier)?\b)[^\n]*\b(?:dlc|length|data\w*|[db][01])\b"
         rb"|\d+\.\d+ \d?[rt](?:11|29) |t[0-9a-f]{3}[0-8](?:[0-9a-f]{2})*\s|\d+\s+[0-9a-f]{8}\s+\d(?:\s+[0-9a-f]{2}\b)+"
     ),
-    "a trace of CODESYS, which has a block per variable: export it as a table": rb"\[key\]; ?\[value\]",
     "JSON": rb"[\[{]\s*[\"{\[]",
     "XML": rb"<\?xml",
 }
@@ -242,9 +241,10 @@ class Format(Protocol):
     """What a module of the table of formats has."""
 
     Source: type[StrictModel]  # The place of a signal in such a file
+    Options: type[StrictModel]  # What is stated of the whole file
 
-    def open_log(self, path: Path, setup: Setup, can: Any | None) -> Reader:
-        """The open file; ``can`` describes the frames of a CAN log; raise ConfigurationError if it lacks a signal."""
+    def open_log(self, path: Path, setup: Setup, options: Any | None) -> Reader:
+        """The open file; raise ConfigurationError if it lacks a signal."""
 
 
 def suffix_of(path: Path) -> str:
@@ -492,9 +492,20 @@ class _Feed:
 class MergedReader(Reader):
     """Reads the files of all sources at the same time; their times must be those of one clock."""
 
-    def __init__(self, path: Path, signals: Mapping[str, Sequence[str]], open_source: Callable[[str], Reader]) -> None:
-        """Open the file of each source; ``signals`` has those of each; ``path`` stands for all files in messages."""
+    def __init__(
+        self,
+        path: Path,
+        signals: Mapping[str, Sequence[str]],
+        open_source: Callable[[str], Reader],
+        *,
+        is_one_file: bool = False,
+    ) -> None:
+        """Open the file of each source; ``signals`` has those of each; ``path`` stands for all files in messages.
+
+        ``is_one_file`` says that all sources are parts of one file, whose times are those of one clock for sure.
+        """
         super().__init__(path)
+        self._is_one_file = is_one_file
         with ExitStack() as opened:
             self._readers = [(name, opened.enter_context(open_source(name))) for name in signals]
             self._opened = opened.pop_all()
@@ -537,7 +548,7 @@ class MergedReader(Reader):
             while feed.end < last.begin:
                 before = feed.end
                 feed.read()
-            if math.isinf(feed.end) and before < last.begin:
+            if math.isinf(feed.end) and before < last.begin and not self._is_one_file:
                 theirs = f"{last.path} begins at t = {last.begin:.12g} s"
                 text = f"ends at t = {before:.12g} s, but {theirs}: both must have the times of one clock"
                 raise ConfigurationError(f"{feed.path}: {text}")

@@ -79,11 +79,15 @@ class TimesRecord(StrictModel):
     signals: dict[str, str]  # Unit of each packed signal, in their order
 
 
+class NoOptions(StrictModel):
+    """Nothing is stated of a whole recording."""
+
+
 class RecordingSource(StrictModel):
     """No keys: a recording has the signals under their own names."""
 
 
-Source = RecordingSource  # for readers.Format
+Source, Options = RecordingSource, NoOptions  # for readers.Format
 
 
 def open_log(path: Path, setup: Setup, _: object = None) -> "RecordingReader":

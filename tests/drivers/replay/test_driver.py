@@ -12,9 +12,9 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay.table import reader as table
 from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from otolith_drivers.replay.readers import Rows
+from otolith_drivers.replay.table import reader as table
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
 from tests.waiting import PATIENCE, wait_for, within

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.replay.cleaning import NoReadings, is_sentinel_number
 from otolith_drivers.replay.readers import Array, Reader
-from otolith_drivers.replay.table.reader import TableReader, TableSource, open_log
+from otolith_drivers.replay.table.options import TableSource
+from otolith_drivers.replay.table.reader import TableReader, open_log
 from tests.messages import assert_each_says, assert_says
 
 SENTINELS = [-999.0, -9999.0, 9999.9, -999.25, 32767.0, -32768.0, 65535.0, 2147483647.0, 1e30, -9.969e36]

@@ -11,28 +11,13 @@ from pydantic import ValidationError
 
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.table.reader import TableSource, open_log
+from otolith_drivers.replay.table.options import TableSource
+from otolith_drivers.replay.table.reader import open_log
+from tests.drivers.replay.readings import samples
 from tests.messages import raises_saying
 
 BEGIN = 1_714_993_372.0  # 2024-05-06 11:02:52 UTC
 NAMED: dict[str, object] = {"time": "Name"}
-
-
-def samples(path: Path, **sources: dict[str, object]) -> dict[str, list[tuple[float, float]]]:
-    """Time (s) and value of each reading, by signal."""
-    signals = tuple(
-        Signal(name=name, unit="1", source=TableSource.model_validate(source)) for name, source in sources.items()
-    )
-    found = dict[str, list[tuple[float, float]]]()
-    with open_log(path, Setup(signals, path.parent, 0.01)) as reader:
-        for rows in reader.chunks():
-            for name, values in rows.columns.items():
-                present = np.isfinite(values)
-                found.setdefault(name, []).extend(
-                    zip(rows.times[present].tolist(), values[present].tolist(), strict=True)
-                )
-        assert reader.bad == 0
-    return found
 
 
 def assert_readings(found: Sequence[tuple[float, float]], times: Sequence[float], values: Sequence[float]) -> None:
@@ -135,12 +120,12 @@ def test_a_counter_or_a_position_before_a_signal_is_no_time(tmp_path: Path) -> N
 
 
 def test_dates_that_contradict_the_times_are_asked_about(tmp_path: Path) -> None:
-    """A tag log of WinCC: ``Time_ms`` counts days since 1899, times a million."""
-    rows = [f'"n";"06.05.2024 11:02:{52 + row}";{row},00;1;{45418460324 + 11.574 * row:.2f}' for row in range(6)]
-    path = table(tmp_path, '"VarName";"TimeString";"VarValue";"Validity";"Time_ms"', rows)
-    with raises_saying(ConfigurationError, "table.csv:1", "Time_ms", "0.0463 s", "TimeString", "4 s", 'time = "'):
-        samples(path, x={"column": "VarValue"})
-    found = samples(path, x={"column": "VarValue", "time": "TimeString"})
+    """Numbers whose name says ms, but which are not."""
+    rows = [f'"06.05.2024 11:02:{52 + row}";{row},00;1;{45418460324 + 11.574 * row:.2f}' for row in range(6)]
+    path = table(tmp_path, '"Moment";"x";"Validity";"Time_ms"', rows)
+    with raises_saying(ConfigurationError, "table.csv:1", "Time_ms", "0.0463 s", "Moment", "4 s", 'time = "'):
+        samples(path, x={})
+    found = samples(path, x={"time": "Moment"})
     assert found["x"] == [(BEGIN + row, float(row)) for row in range(6)]
 
 
@@ -208,13 +193,6 @@ def test_date_and_time_of_day_may_stand_in_two_columns(tmp_path: Path) -> None:
         samples(path, x={"time": {"column": "Uhrzeit", "date": "Tag"}})
 
 
-@pytest.mark.parametrize("names", ["VarName", "tag", "Variable", "entity_id", "_field", "path"])
-def test_a_table_with_one_value_per_row_is_named(tmp_path: Path, names: str) -> None:
-    path = table(tmp_path, f"{names};TimeString;Value", ["U;2024-05-06 11:02:00;24.0", "N;2024-05-06 11:02:00;100"])
-    with raises_saying(ConfigurationError, "one value per row", names, "column per variable"):
-        samples(path, x={"column": "U"})
-
-
 def test_a_unit_that_measures_no_time_is_refused() -> None:
     with pytest.raises(ValidationError, match="time"):
         TableSource.model_validate({"time": {"column": "t", "unit": "V"}})
@@ -244,7 +222,7 @@ def test_any_times_beside_each_other_reach_their_signals(
     sources: dict[str, dict[str, object]] = {
         f"x{at}": {"time": {"column": clock, "unit": "ms"}} for at, clock in enumerate(clocks)
     }
-    found = samples(path, **sources)
+    found = samples(path, None, 0, "", **sources)
     for at, (period, end) in enumerate(zip(periods, lengths, strict=True)):
         values = [1000.0 * at + row for row in range(end)]
         assert_readings(found[f"x{at}"], [1e-3 * period * row for row in range(end)], values)

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.table import reader as tables
 from otolith_drivers.replay.readers import Rows
+from otolith_drivers.replay.table import reader as tables
 from otolith_drivers.replay.table.header import MAX_PREAMBLE
-from otolith_drivers.replay.table.reader import TableReader, TableSource
+from otolith_drivers.replay.table.options import TableSource
+from otolith_drivers.replay.table.reader import TableReader
 from tests.messages import raises_saying
 
 
@@ -123,8 +124,8 @@ def test_times_may_be_dates(tmp_path: Path, written: str, heading: str) -> None:
     assert numbers(rows) == [1.5, 2.5]
 
 
-@pytest.mark.parametrize("written", ["03/29/2026 01:59:58", "01:59:58.25", "2026-13-29 01:59:58", "today"])
-def test_dates_that_leave_open_the_day_are_refused(tmp_path: Path, written: str) -> None:
+@pytest.mark.parametrize("written", ["2026-13-29 01:59:58", "today"])
+def test_times_that_are_none_are_refused(tmp_path: Path, written: str) -> None:
     path = tmp_path / "table.csv"
     path.write_text(f"t,x\n{written},1.5\n", encoding="utf-8")
     with raises_saying(ConfigurationError, "table.csv:2", "t is ", "seconds", "Unix", "date"):

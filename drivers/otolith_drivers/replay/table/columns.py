@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from otolith_drivers.replay.readers import DataFile
 from otolith_drivers.replay.table.header import is_number, read_header
-from otolith_drivers.replay.table.reader import TableReader, TableSource, decoded
+from otolith_drivers.replay.table.options import TableSource
+from otolith_drivers.replay.table.reader import TableReader, decoded
 from otolith_drivers.units import is_unit
 
 ANY_UNIT = "1"  # of a column whose numbers are read as they stand

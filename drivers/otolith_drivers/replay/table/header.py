@@ -13,18 +13,18 @@ import numpy as np
 from otolith_drivers.config_files import Range
 from otolith_drivers.errors import ConfigurationError, nearest, shown
 from otolith_drivers.replay.readers import Array, seen
-from otolith_drivers.replay.table.times import BESIDE_NAME, contradiction, date_column, rises_evenly
+from otolith_drivers.replay.table.times import BESIDE_NAME, TimeRequest, contradiction, date_column, rises_evenly
 from otolith_drivers.units import are_equal, factor, is_unit
 
 # Engineering choice: a thousand columns need some 20 000. Bounds the memory for a file without line ends.
 MAX_LINE = 100_000  # characters
 TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names none
 SEGMENT = "segment"  # optional column: a change of its text begins a new recording
-SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
+SEPARATORS = (";", "\t", "|", ",")  # in this order: a comma may be a decimal sign
 HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name and unit
 # Other names of the column of the time, if none is 't'; its unit also stands behind an underscore.
 TIME_NAME = re.compile(
-    r"(?:t|_?time|time[ _]?stamp|date[ _/]*(?:and )?time|(?:datum[ _/]*(?:und )?)?(?:uhr)?zeit(?:stempel)?)"
+    r"(?:t|_?time|time[ _]?(?:stamp|string)|date[ _/]*(?:and )?time|(?:datum[ _/]*(?:und )?)?(?:uhr)?zeit(?:stempel)?)"
     r"(?:_(s|ms|us))?",
     re.IGNORECASE,
 )
@@ -36,13 +36,15 @@ NAMES_NAME = re.compile(
     r"(?:var|variable|tag|signal|channel|entity|path|topic|_?field|_?measurement)[_ ]?(?:name|id)?", re.IGNORECASE
 )
 VALUE_NAME = re.compile(r"(?:var|tag)?[_ ]?(?:value|wert)|state", re.IGNORECASE)
-ONE_COLUMN_EACH = "export it with a column per variable, or turn it with a spreadsheet's pivot table"
+WHICH_COLUMNS = 'write table = { names = "...", values = "..." } with the columns of both under [driver]'
 MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
+MIN_RAGGED = 2  # of them without their last cells, from which on all rows may be so; one may be damaged
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
-BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
+BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none|unavailable|unknown)?$"
 
 Place = tuple[int, str | None]  # position of a column in a row, from 0, and its unit if the header has it
+Others = tuple[tuple[str, int, str | None], ...]  # name, position and unit of columns that no signal uses
 
 
 class Column(NamedTuple):
@@ -65,19 +67,21 @@ class Column(NamedTuple):
 
 
 class ColumnRequest(NamedTuple):
-    """Name of a wanted column, unit of its signal, and unit of its numbers if the machine file names it."""
+    """Name of a wanted column, unit of its signal, and unit of its numbers if the machine file names it.
+
+    The value in that unit is ``scale * number + offset``.
+    """
 
     column: str
     unit: str
     written: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
 
-
-class TimeRequest(NamedTuple):
-    """Name of the column of the time, the unit of its numbers, and the column of the date if it has none."""
-
-    column: str = TIME
-    unit: str | None = None
-    date: str | None = None
+    @property
+    def is_scaled(self) -> bool:
+        """Whether ``written`` is the unit of the value, and not of the number."""
+        return (abs(self.scale), self.offset) != (1.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,7 @@ class Header:
     """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
     date: int | None = None  # Position of the column of the date in a row, from 0, if that of the time has none
     is_shared: bool = False  # Whether other columns of a row may have times of their own
+    is_ragged: bool = False  # Whether rows lack the cells at their end that are blank
     is_unit_stated: bool = True  # Whether that of the time is
     beside: tuple[list[str], ...] = ()  # Cells of the lines that may have units: some below it, and the one above
 
@@ -135,12 +140,11 @@ def read_header(
         elif is_comment:
             commented = line.lstrip("# ")
             continue
-        try:
-            places, others = _places(f"{path}:{number}", cells, wanted)
+        if (found := _found(f"{path}:{number}", above, cells, wanted)) is not None:
+            cells, places, others = found
             break
-        except ConfigurationError:
-            faults.append((sum(not is_number(cell) for cell in cells if cell), -number, cells))
-            above, read = cells, read + line
+        faults.append((sum(not is_number(cell) for cell in cells if cell), -number, cells))
+        above, read = cells, read + line
     else:
         if not faults:
             raise ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
@@ -151,8 +155,9 @@ def read_header(
     units, skipped = _units_beside(above, split, wanted, places)
     date = _place_of_date(f"{path}:{number}", clock, others)
     if date is None:
-        date = date_column([_name_and_unit(cell)[0] for cell in cells], split, places[clock.column][0])
-    columns, is_unit_stated = _columns(f"{path}:{number}", cells, wanted, places, units)
+        date = date_column([name_and_unit(cell)[0] for cell in cells], split, places[clock.column][0])
+    places = {name: (index, written or units.get(index)) for name, (index, written) in places.items()}
+    columns, is_unit_stated = columns_of(f"{path}:{number}", cells, wanted, places, clock)
     named = max(index for index, cell in enumerate(cells) if cell) + 1
     is_wanted = SEGMENT in {request.column for request in wanted.values()}
     segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
@@ -168,12 +173,44 @@ def read_header(
         others,
         date,
         is_shared=time is not None,
-        is_unit_stated=is_unit_stated,
+        is_ragged=sum(1 < len(row) < named for row in split[skipped:]) >= MIN_RAGGED,
+        is_unit_stated=is_unit_stated or clock.epoch is not None,
         beside=beside,
     )
     if time is None and (question := _question(header, cells, split[skipped:])):
         raise ConfigurationError(f"{path}:{number}: {question}")
     return header
+
+
+def _found(
+    place: str, above: list[str], cells: list[str], wanted: Mapping[str, ColumnRequest]
+) -> tuple[list[str], dict[str, Place], Others] | None:
+    """The cells of the header, if it is this line, alone or with that above, and what :func:`_places` returns."""
+    for names in (cells, _names_below(above, cells, wanted[TIME].column)):
+        with contextlib.suppress(ConfigurationError):
+            return names, *_places(place, names, wanted)
+    return None
+
+
+def _names_below(above: list[str], cells: list[str], time: str) -> list[str]:
+    """The names in two lines as one: that of the time in the upper, and those of the signals below; else none.
+
+    Below that of the time stands its unit, or nothing.
+    """
+    for index, (upper, lower) in enumerate(zip(above, cells, strict=False)):
+        name, unit = name_and_unit(upper)
+        unit = unit or lower.strip("[]()")
+        if (name == time or TIME_NAME.fullmatch(name)) and (not lower or measures_time(unit)):
+            return [*cells[:index], f"{name} [{unit}]" if unit else name, *cells[index + 1 :]]
+    return []
+
+
+def measures_time(unit: str) -> bool:
+    """Whether a text is a unit of time."""
+    with contextlib.suppress(ValueError):
+        factor(unit, SECONDS)
+        return True
+    return False
 
 
 def _place_of_date(place: str, time: TimeRequest, others: tuple[tuple[str, int, str | None], ...]) -> int | None:
@@ -186,27 +223,28 @@ def _place_of_date(place: str, time: TimeRequest, others: tuple[tuple[str, int, 
     return at
 
 
-def _columns(
+def columns_of(
     place: str,
     cells: list[str],
     wanted: Mapping[str, ColumnRequest],
     places: Mapping[str, Place],
-    beside: Mapping[int, str],
+    time: TimeRequest,
 ) -> tuple[dict[str, Column], bool]:
     """The column of the time and of each signal, and whether the unit of the time is stated."""
     columns: dict[str, Column] = {}
     is_stated = False
     for signal, request in wanted.items():
         index, written = places[request.column]
-        stated = written or beside.get(index)
-        unit = request.written or stated
+        unit = request.written or written
         is_stated |= signal == TIME and unit is not None
-        if request.written and stated and _is_contradicted(request.written, stated, request.unit):
-            fault = f"the table says {shown(stated)}, the machine file unit = {shown(request.written)}"
+        asked = None if request.is_scaled or (signal == TIME and time.is_known) else request.written
+        if asked and written and _is_contradicted(asked, written, request.unit):
+            fault = f"the table says {shown(written)}, the machine file unit = {shown(request.written)}"
             remedy = f"remove unit from the {'time of the ' if signal == TIME else ''}signal, or correct the table"
             raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {fault}: {remedy}")
         try:
-            columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
+            scale, offset = (1.0, 0.0) if unit is None else factor(unit, request.unit)
+            columns[signal] = Column(index, scale * request.scale, scale * request.offset + offset)
         except ValueError as error:
             raise ConfigurationError(f"{place}: column {index + 1} ({shown(cells[index])}): {error}") from error
     return columns, is_stated
@@ -226,7 +264,7 @@ def _is_contradicted(written: str, stated: str, target: str) -> bool:
 def columns_called(name: str, line: str) -> int:
     """How many columns have the ``name``, if ``line`` is the header."""
     rows = (split_quoted(line, sign) for sign in SEPARATORS)
-    return max(sum(name in (cell, _name_and_unit(cell)[0]) for cell in row) for row in rows)
+    return max(sum(name in (cell, name_and_unit(cell)[0]) for cell in row) for row in rows)
 
 
 def _question(header: Header, cells: list[str], rows: list[list[str]]) -> str:
@@ -256,7 +294,7 @@ def _numbers_in(rows: list[list[str]], index: int) -> list[float]:
 
 def _places(
     place: str, cells: list[str], wanted: Mapping[str, ColumnRequest], kind: str = ""
-) -> tuple[dict[str, Place], tuple[tuple[str, int, str | None], ...]]:
+) -> tuple[dict[str, Place], Others]:
     """The place of each wanted column, and of that of segments if there is one; name and place of the others.
 
     ``kind`` is the format that the file seems to have, for the error.
@@ -267,7 +305,7 @@ def _places(
     places: dict[str, Place] = {}
     others, times, clocks = list[tuple[str, int, str | None]](), list[tuple[str, Place]](), list[Place]()
     for index, cell in enumerate(cells):
-        name, written = _name_and_unit(cell)
+        name, written = name_and_unit(cell)
         name = cell if cell in known else name
         match = TIME_NAME.fullmatch(name)
         if name == time:
@@ -335,7 +373,7 @@ def is_number(cell: str) -> bool:
     return re.match(NUMBER, cell.replace(",", ".")) is not None
 
 
-def _name_and_unit(cell: str) -> tuple[str, str | None]:
+def name_and_unit(cell: str) -> tuple[str, str | None]:
     """The name in a cell of the header, and its unit if it has one; other parentheses belong to the name."""
     name, unit, in_parentheses = HEADER_CELL.findall(cell)[0]
     if in_parentheses and (is_number(in_parentheses) or not is_unit(in_parentheses)):
@@ -380,7 +418,7 @@ def _missing(request: ColumnRequest, others: list[str], cells: list[str], kind: 
     if kind:
         return f"{what}; the file looks like {kind}"
     if request.column == TIME and (named := _names_of_values(cells)):
-        return f"{what}; the table seems to have one value per row, named in {named!r}: {ONE_COLUMN_EACH}"
+        return f"{what}; the table seems to have one value per row, named in {named!r}: {WHICH_COLUMNS}"
     twice = [name for name in dict.fromkeys(cells) if name and cells.count(name) > 1]
     if request.unit == SECONDS and twice:
         return f"{what}; {cells.count(twice[0])} columns are called {twice[0]!r}: {BESIDE_IT}"

@@ -1,4 +1,4 @@
-"""The times of a table: dates, days since 1899, and what is asked where they may mean something else.
+"""The times of a table: numbers, dates, times of the day, and what is asked where they may mean something else.
 
 A wrong unit of the time makes every estimate wrong, without any sign of it. So a unit that is not stated is questioned
 where the rows would come faster than any logger writes, and a column of the time beside which another one contradicts.
@@ -9,7 +9,8 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,16 +18,23 @@ import pyarrow.compute as pc
 
 from otolith_drivers.common.message_times import unix_time
 from otolith_drivers.errors import shown
-from otolith_drivers.replay.readers import Array
+from otolith_drivers.replay.readers import Array, Integers
 from otolith_drivers.units import factor
 
 DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
+# Day and month, in an order that depends on the country; a year behind them.
+EITHER_FIRST = re.compile(r"\s*(\d{1,2})([/-])(\d{1,2})\2(\d{4}|\d\d)(?=\D|$)")
 DATE_NAME = re.compile(r"datum|date", re.IGNORECASE)
 TIME_IN_DATE = re.compile(r"\d:\d\d")
 TIME_OF_DAY = re.compile(r"\s*\d{1,2}:\d\d")
+CLOCK_TIME = re.compile(r"\s*(\d{1,3}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?\s*")
+HALF_CLOCK_TIME = re.compile(r"\s*\d{1,3}:[0-5]\d(?:[.,]\d{1,9})?\s*")  # hours and minutes, or minutes and seconds
+FRACTION = re.compile(r"(?<=\d)[.,](\d{1,12})(?=\D*$)")  # of the second
+NO_YEAR = 1900  # of a date that has none, for strptime
 # Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
 SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
-DAY = 86_400.0  # s
+DAY, HOUR = 86_400.0, 3600.0  # s
+QUARTER = 900.0  # s: clocks of all zones change at such a time
 # Engineering choices, guarded by tests/drivers/replay/test_table_times.py.
 MIN_INTERVAL = 1e-6  # s: no logger of a machine writes rows more often, so their times are in another unit
 PLAUSIBLE = (1e-5, 3600.0)  # s between two rows, for the units that are proposed
@@ -36,6 +44,131 @@ ALIKE = 0.5  # share of the longer one by which two spans of the same rows may d
 # Names of columns that have the times of the column behind them, as TwinCAT Scope and LabVIEW write them.
 BESIDE_NAME = re.compile(r"name|x|.*(?:time|zeit).*", re.IGNORECASE)
 EVEN = 1e-3  # share by which the intervals of the first rows may differ where they are even
+
+
+class TimeRequest(NamedTuple):
+    """Where the times of a table are, and how they are written; what is None follows from header and cells."""
+
+    column: str = "t"
+    unit: str | None = None  # Of numbers
+    date: str | None = None  # Column of the date, if that of the time has none
+    format: str | None = None  # Of the date, with that of its own column in front, as strptime takes it
+    zone: tzinfo | None = None  # Without it, that of the machine
+    epoch: datetime | None = None  # From which numbers count; on the clock of the zone if it names none
+    is_known: bool = False  # Whether the format of the file defines all this, whatever its header says
+
+
+class Clock:
+    """The cells of a column of times as Unix times, or seconds from any start. Cells must come in their order."""
+
+    def __init__(self, request: TimeRequest, scale: float, zone: tzinfo, *, has_dates: bool = False) -> None:
+        """``scale`` is the unit of numbers, s; ``zone`` that of dates that name none, unless the request does.
+
+        ``has_dates`` says that dates stand in front of the times of the day.
+        """
+        self._request, self._scale, self._zone = request, scale, request.zone or zone
+        self._has_days: bool | None = False if has_dates else None  # whether times of the day stand alone: the first
+        self._midnights, self._latest = 0, -math.inf  # of times of the day
+
+    def times(self, written: Array, texts: pa.StringArray) -> Array:
+        """Return the times (n,), s, of cells: NaN for a blank one, infinity for one that is no time.
+
+        ``written`` are the numbers in them, s: NaN for a blank cell, infinity for another text.
+        """
+        if self._request.format is not None:
+            written = np.where(np.isfinite(written), np.inf, written)
+        dates = np.flatnonzero(np.isinf(written))
+        cells = texts.take(pa.array(dates)).to_pylist()
+        if self._has_days is None:
+            self._has_days = self._begins_with_time_of_day(written, dates, cells)
+        times = np.where(np.isfinite(written), np.inf, written) if self._has_days else self._of_numbers(written)
+        times[dates] = [self._of_text(cell) for cell in cells]
+        return times
+
+    def _begins_with_time_of_day(self, written: Array, dates: Integers, cells: Sequence[str]) -> bool | None:
+        """Whether the first time is one of the day: then all are, or none is; None if no cell is a time."""
+        first = np.flatnonzero(np.isfinite(written))
+        for row, cell in zip(dates.tolist(), cells, strict=True):
+            if len(first) and first[0] < row:
+                return False
+            if CLOCK_TIME.fullmatch(cell):
+                return True
+            if math.isfinite(date_of(cell, UTC)):
+                return False
+        return False if len(first) else None
+
+    def _of_numbers(self, times: Array) -> Array:
+        """Return ``times`` (n,), s, from the start that the request or a spreadsheet has."""
+        epoch = self._request.epoch
+        if epoch is None:
+            return since_1970(times, self._scale, self._zone)
+        if epoch.tzinfo is not None:
+            return times + epoch.timestamp()
+        return on_wall_clock(times + epoch.replace(tzinfo=UTC).timestamp(), self._zone)
+
+    def _of_text(self, text: str) -> float:
+        if self._request.format is not None:
+            return self._formatted(text, self._request.format)
+        if self._has_days:
+            if (parts := CLOCK_TIME.fullmatch(text)) is None:
+                return math.inf
+            hours, minutes, seconds = map(int, parts.groups()[:3])
+            fraction = float(f"0.{parts[4]}") if parts[4] else 0.0
+            return self._after_midnights(HOUR * hours + 60.0 * minutes + seconds + fraction, DAY)
+        return date_of(text, self._zone)
+
+    def _formatted(self, text: str, form: str) -> float:
+        """Return the time of a date in the stated format, in which the fraction of a second may be absent."""
+        text, fraction = text.strip(), 0.0
+        if "%f" not in form and (part := FRACTION.search(text)) is not None:
+            text, fraction = text[: part.start()] + text[part.end() :], float(f"0.{part[1]}")
+        with contextlib.suppress(ValueError, OverflowError):
+            moment = datetime.strptime(FRACTION.sub(lambda part: f".{part[1][:6]}", text), form)  # noqa: DTZ007 - in no zone
+            if moment.year > NO_YEAR:
+                return unix_time(moment, self._zone) + fraction
+            since = (moment.replace(tzinfo=UTC) - datetime(NO_YEAR, 1, 1, tzinfo=UTC)).total_seconds() + fraction
+            return self._after_midnights(since, DAY if re.search("%[HI]", form) else HOUR)
+        return math.inf
+
+    def _after_midnights(self, time: float, period: float) -> float:
+        """Return a time (s) of the day or of the hour, whose clock starts again after ``period`` s."""
+        time += self._midnights * period
+        if time < self._latest - 0.5 * period:
+            self._midnights += 1
+            time += period
+        self._latest = max(self._latest, time)
+        return time
+
+    def question(self, text: str) -> str:
+        """Return what is asked of a cell that may be two times; empty if it is none at all."""
+        if HALF_CLOCK_TIME.fullmatch(text):
+            return self._question(text, "minutes and seconds, or hours and minutes", "%M:%S", "%H:%M")
+        if (parts := EITHER_FIRST.match(text)) is None:
+            return ""
+        sign, year = parts[2], "%Y" if len(parts[4]) > 2 else "%y"
+        clock = ""
+        if TIME_IN_DATE.search(text):
+            has_half = re.search("[ap]m", text, re.IGNORECASE)
+            seconds = ":%S" if text.count(":") > 1 else ""
+            clock = f" %I:%M{seconds} %p" if has_half else f" %H:%M{seconds}"
+        forms = (f"%{first}{sign}%{second}{sign}{year}{clock}" for first, second in ("dm", "md"))
+        return self._question(text, "the day or the month first", *forms)
+
+    def _question(self, text: str, what: str, *forms: str) -> str:
+        keys = f'column = "{self._request.column}", ' + (
+            f'date = "{self._request.date}", ' if self._request.date else ""
+        )
+        either = " or ".join(f'format = "{form}"' for form in forms)
+        return f"{shown(text)} may have {what}: write time = {{ {keys}{either} }} for each signal"
+
+
+def on_wall_clock(local: Array, zone: tzinfo) -> Array:
+    """Return the Unix times of ``local`` (n,), s since 1970 on the clocks of ``zone``."""
+    quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
+    begin = datetime(1970, 1, 1, tzinfo=UTC)
+    moments = (begin + timedelta(seconds=QUARTER * float(quarter)) for quarter in quarters)
+    offsets = [moment.replace(tzinfo=zone).utcoffset() or timedelta() for moment in moments]
+    return np.asarray(local - np.array([offset.total_seconds() for offset in offsets])[place])
 
 
 def date_column(names: Sequence[str], rows: Sequence[Sequence[str]], time: int) -> int | None:
@@ -70,9 +203,7 @@ def since_1970(times: Array, scale: float, zone: tzinfo) -> Array:
     low, high = (DAY * days for days in SPREADSHEET_DAYS)
     counted = np.flatnonzero((times >= low) & (times <= high))
     moved = times.copy()
-    for row in counted:
-        local = datetime.fromtimestamp(float(times[row]) - DAY * DAYS_TO_1970, UTC).replace(tzinfo=None)
-        moved[row] = unix_time(local, zone)
+    moved[counted] = on_wall_clock(times[counted] - DAY * DAYS_TO_1970, zone)
     return moved
 
 
