@@ -14,6 +14,7 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
+from otolith.estimation.sensor_models import SensorModel
 from otolith.health.diagnosis import LIMITS, MonitoringPlan, Rule, RulesFile, worded
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity
 from otolith.health.schema import Language
@@ -186,7 +187,8 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
         for name, table in file.read_signals.items()
     }
     tables = {name: signals.get(name, SignalTable()) for name in twin.signals}
-    problem = replace(_problem(file, twin, context), unchecked=_unchecked(tables))
+    sensors = _sensors(tables, twin, context)
+    problem = replace(_problem(file, twin, context), unchecked=_unchecked(tables), sensors=sensors)
     driver = None
     if with_driver and (file.drivers or file.read_signals or not for_replay):
         driver = build_driver(driver_configs(file, twin, source))
@@ -230,6 +232,29 @@ def _common(table: Mapping[str, Any]) -> dict[str, Any]:
 def _unchecked(tables: Mapping[str, SignalTable]) -> frozenset[tuple[str, Check]]:
     """Return the checks that are turned off, each with its signal."""
     return frozenset((name, check) for name, table in tables.items() for check in Check if check not in table.checks)
+
+
+def _sensors(
+    tables: Mapping[str, SignalTable], twin: Definition, context: Context
+) -> tuple[tuple[str, SensorModel], ...]:
+    """Return the sensors whose reading may stay while what they measure moves, each with its signal."""
+    outputs = {output.name: output.unit for output in twin.outputs}
+    sensors = []
+    for name, table in tables.items():
+        written = {key: getattr(table, key) for key in ("resolution", "dead_band", "renewed")}
+        stated: dict[str, float] = {}
+        for key, value in written.items():
+            if value is None:
+                continue
+            if name not in outputs:
+                context.fail(("signals", name, key), f"{name} is an input of the twin: {key!r} is of an output")
+                continue
+            unit = f"({outputs[name]})*s" if key == "renewed" else outputs[name]
+            with context.at("signals", name, key):
+                stated[key] = Quantity(unit, low=0.0, difference=True)(value)
+        if stated:
+            sensors.append((name, SensorModel(**stated)))
+    return tuple(sensors)
 
 
 def library_twins() -> list[str]:

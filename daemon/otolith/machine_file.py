@@ -139,6 +139,9 @@ class SignalTable(StrictModel):
     times: Sampling | None = None  # Meaning of the times of its samples; without it what the source gives
     on_change: bool | None = None  # Whether a command is recorded only when it changes; by default the record shows it
     checks: tuple[Check, ...] = tuple(Check)  # The checks of its data; an empty list turns them off
+    resolution: RawQuantity | None = None  # Step of its readings
+    dead_band: RawQuantity | None = None  # By which what it measures departs from a reading before the next one
+    renewed: RawQuantity | None = None  # Distance after which a speed from edge times has a new reading
 
 
 class UnmeasuredTable(StrictModel):

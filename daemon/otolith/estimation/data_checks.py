@@ -3,7 +3,8 @@
 - A **spike** rises and falls within two samples, so the second difference around it reads -1/2, 1, -1/2 at equal steps.
   The kink that a voltage step leaves in a current does not (compare F. R. Hampel, The influence curve and its role in
   robust estimation, Journal of the American Statistical Association 69, 1974). Single spikes count as missing.
-- A channel is **frozen** where it keeps one value that its prediction from all other data makes improbable. The
+- A channel is **frozen** where it keeps one value that its prediction from all other data makes improbable, also with
+  the dead band or the edges of its sensor (:mod:`otolith.estimation.sensor_models`). The
   prediction is that of the filter, with its uncertainty: the run counts as missing, and parameters, initial state and
   process noise are free within what is known of them. What a disturbance of one equation explains, as dry friction that
   holds an axis, is no fault of the sensor.
@@ -31,6 +32,7 @@ from otolith.estimation.evidence import CHANCE, chi_square_limit
 from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
+from otolith.estimation.sensor_models import RENEWED_DISTANCES, distance, is_driven_position, new_readings
 from otolith.estimation.window_fit import fit_predicted
 from otolith.twin.definition import Definition, Output
 from otolith_drivers.units import unit_text
@@ -114,7 +116,8 @@ def check_window(window: Window, predicted: Posterior) -> CheckedWindow:
     if faulty:
         return CheckedWindow(cleaned, faulty_sensors=tuple(faulty))
     cleaned, repeated = drop_repeats(cleaned, problem.base_model, _channels(problem, Check.STALE))
-    return CheckedWindow(cleaned, (*notes, *repeated))
+    held = frozenset(name for name, sensor in problem.sensors if sensor.holds)
+    return CheckedWindow(new_readings(cleaned, held), (*notes, *repeated))
 
 
 def _channels(problem: Problem, check: Check) -> frozenset[str]:
@@ -257,6 +260,13 @@ class _Channel:
         """(samples,) records with a sample."""
         return np.flatnonzero(~self.window.missing_in(self.name))
 
+    def within(self, band: float, prediction: Array, runs: list[Indices]) -> "_Channel":
+        """Return the channel with the values of ``runs`` nearest to ``prediction`` (records,) within the dead band."""
+        values, column = self.window.values.copy(), self.window.signals.index(self.name)
+        for run in runs:
+            values[run, column] = np.clip(prediction[run], values[run, column] - band, values[run, column] + band)
+        return replace(self, window=replace(self.window, values=values))
+
     def without(self, records: Indices) -> Window:
         """Return the window with the signal missing in ``records``."""
         missing = self.window.missing.copy()
@@ -388,17 +398,29 @@ def _frozen_run(channel: _Channel, runs: list[Indices]) -> _FrozenRun | None:
     values, noise = channel.values[channel.present], problem.noise[at]
     reduced = channel.without(np.concatenate([run[1:] for run in runs]))
     step, lacking = unmodelled_rounding(values, noise, problem.steps[at] if problem.steps else 0.0)
+    sensor = problem.sensor(channel.name)
+    if (held := sensor.step(values, noise)) > step:
+        step, lacking = held, max(lacking, held**2 / 12.0)
     if lacking:
         problem = _with_noise(problem, at, float(np.sqrt(noise**2 + lacking)))
     prediction = fit_predicted(channel.predicted, problem, reduced).predict()[0][:, at]
     movement = FROZEN_MOVEMENT * noise + FROZEN_STEPS * step
     moving = [run for run in runs if np.ptp(prediction[run[0] : run[-1] + 1]) > movement]  # false for not-a-number
+    if sensor.renewed:
+        least, times = RENEWED_DISTANCES * sensor.renewed, channel.window.grid.offsets
+        moving = [run for run in moving if distance(prediction, times, run) > least]
     if _samples_in(moving) <= MAX_FROZEN_SHARE * len(values):
         return None
-    if not _lacks_noise(channel, runs):
-        rounding = _samples_in(runs) * 0.25 * step**2 / (noise**2 + step**2 / 12.0)
+    rounding = _samples_in(runs) * 0.25 * step**2 / (noise**2 + step**2 / 12.0)
+    if sensor.dead_band:
+        within = channel.within(sensor.dead_band, prediction, moving)
+        if _is_probable(within, channel.predicted.problem, reduced, 0.0):
+            return None
+    elif sensor.holds or held or not _lacks_noise(channel, runs):
         if _are_probable(channel, problem, moving, reduced, rounding):
             return None
+    elif is_driven_position(problem.base_model, channel.name) and _is_probable(channel, problem, reduced, rounding):
+        return None  # the twin itself explains a machine that stands
     excess = np.concatenate([prediction[run] - channel.values[run] for run in moving])
     return _FrozenRun(max(moving, key=len), float(np.median(excess)))
 

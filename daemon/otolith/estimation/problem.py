@@ -12,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array
+from otolith.estimation.sensor_models import SensorModel
 from otolith.twin.components import (
     MAX_COMPONENTS,
     ComponentFamily,
@@ -122,6 +123,7 @@ class Problem:
     """Components in the twin. Their values are free parameters with names that begin with an underscore."""
     unchecked: frozenset[tuple[str, Check]] = frozenset()
     """Checks of the data that are turned off, each with its signal."""
+    sensors: tuple[tuple[str, SensorModel], ...] = ()  # Of the signals whose reading may stay
     delays: tuple[tuple[str, float], ...] = ()
     """Signals that are late in the windows, and by how many seconds: their samples are moved before a fit."""
     changing: tuple[str, ...] = ()  # Commands that change between their samples, as windows have shown it
@@ -155,6 +157,10 @@ class Problem:
         twin = self.base_model
         inputs, states = self.input_noise or (0.0,) * len(twin.inputs), self.process_noise or (0.0,) * len(twin.states)
         return (*inputs, *self.noise, *states)
+
+    def sensor(self, name: str) -> SensorModel:
+        """Return how the reading of a signal follows what it measures, as far as the machine file states it."""
+        return dict(self.sensors).get(name, SensorModel())
 
     @property
     def stated_levels(self) -> tuple[float, ...]:

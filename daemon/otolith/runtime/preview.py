@@ -23,6 +23,7 @@ from otolith.adaptation.state import initial_state
 from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
 from otolith.estimation.objective import Objective, adc_step
 from otolith.estimation.problem import Problem, WindowOptions
+from otolith.estimation.sensor_models import shown_model
 from otolith.health.times import in_local_time
 from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
 from otolith.runtime.replay import Replay, Stopped, open_recorded
@@ -175,7 +176,11 @@ def preview_recording(
         is_partial=max_rows is not None,
         computing_s=median(seconds) if seconds else None,
         longest_computing_s=max(seconds, default=None),
-        remarks=(*survey.warnings, *_remarks(survey.plans, statistics, samplings)),
+        remarks=(
+            *survey.warnings,
+            *_remarks(survey.plans, statistics, samplings),
+            *_sensor_remarks(machine, survey.chosen),
+        ),
     )
 
 
@@ -393,6 +398,24 @@ def _end_remarks(values: Array) -> Iterator[str]:
         if levels[at] and share >= MIN_AT_END and counts[at] > MIN_END_RATIO * counts[near].mean():
             exactly = f"{share:.0%} of the samples have exactly its {name} value, {levels[at]:.4g}"
             yield f"{exactly}: if the sensor ends there, leave these cells blank"
+
+
+def _sensor_remarks(machine: LoadedMachine, windows: Sequence[Window]) -> Iterator[str]:
+    """Yield which sensors have a dead band or renew their reading at edges, and what to write then."""
+    problem = machine.problem
+    for output, noise in zip(problem.base_model.outputs, problem.noise, strict=True):
+        if problem.sensor(output.name).holds:
+            continue
+        shown = shown_model(windows, output.name, noise)
+        if shown.dead_band:
+            key, how = f'dead_band = "{shown.dead_band:.3g} {output.unit}"', "the value stays, and changes by at least"
+            what = f"{how} {shown.dead_band:.3g} {unit_text(output.unit)}, as of a sensor with a dead band"
+        elif shown.renewed:
+            key = f'renewed = "{shown.renewed:.3g} ({output.unit})*s"'
+            what = "a new value comes after the same distance each, as of a speed from the times of edges"
+        else:
+            continue
+        yield f"{output.name}: {what}: write {key} under it in [signals], so that repeated values are no readings"
 
 
 def _renewal_remarks(sampling: SignalSampling) -> Iterator[str]:
