@@ -28,6 +28,7 @@ SOURCES = {
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
     "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],
+    "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin"],
 }

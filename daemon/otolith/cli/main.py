@@ -41,6 +41,7 @@ from otolith.cli.operation.explain import explain
 from otolith.cli.operation.history import history, report, reproduce
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
+from otolith.cli.operation.simulate import simulate
 from otolith.cli.operation.view import view
 from otolith.cli.terminal import echo
 
@@ -381,6 +382,7 @@ COMMANDS: tuple[click.Command, ...] = (
     report,
     reproduce,
     reset,
+    simulate,
     twin,
     view,
 )

@@ -65,7 +65,7 @@ class Objective:
         if problem.components:  # a faulty sensor shows the first state far from where it is
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
             lowest, highest = lowest - wider, highest + wider
-        given = dict(problem.known) | _time_offsets(problem, window)
+        given = dict(problem.known) | time_offsets(problem, window.start)
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
         self.free, self._states = len(problem.free), len(twin.states)
         self._choose_columns(problem)
@@ -279,10 +279,10 @@ def _held(values: Array, sampled: Indices, offsets: Array, hold: str) -> Array:
     return np.asarray(values[np.maximum(last, 0)])
 
 
-def _time_offsets(problem: Problem, window: Window) -> dict[str, float]:
-    """Return the settings that count the time of a window from the origins of the components."""
+def time_offsets(problem: Problem, start: float) -> dict[str, float]:
+    """Return the settings that count time from the origins of components; the first record is at ``start`` s."""
     return {
-        shift_setting(slot): window.start - component.origin
+        shift_setting(slot): start - component.origin
         for slot, component in enumerate(problem.components)
         if component.source == "t" and not component.periodic
     }

@@ -71,6 +71,25 @@ class Posterior:
         belief = self._propagate_phases(window.start, window.sample_period)
         return replace(self, belief=imm_filter.predict(belief, window.end))
 
+    def at_last_record(self) -> "Posterior":
+        """Return the same with phases at the last record of the last window, where :attr:`PhaseAdvance.last_state` is.
+
+        The last step of that window counts as the sample period.
+        """
+        phase, problem = self.phase, self.problem
+        step = problem.window.sample_period or 0.0
+        if phase is None:
+            return self
+        by = []
+        for component, advance in zip(problem.components, phase.by, strict=True):
+            symbol = source_of(problem.base_model, component.source).symbol
+            names = [state.name for state in problem.base_model.states]
+            speed = symbol.removeprefix("_angle_")
+            rate = phase.last_state[names.index(speed)] if speed in names and phase.last_state else 0.0
+            by.append(advance - step * (rate if symbol.startswith("_angle_") else 1.0))
+        last = replace(phase, next_start=phase.next_start - step, by=tuple(by))
+        return replace(self, belief=replace(self, phase=last)._propagate_phases(last.next_start, max(step, 1e-9)))
+
     def propagate_phases(self, advance: PhaseAdvance, window: Window) -> "Posterior":
         """Return the same with phases at the first record of ``window``, which ``advance`` leads to."""
         return replace(self, belief=replace(self, phase=advance)._propagate_phases(window.start, window.sample_period))

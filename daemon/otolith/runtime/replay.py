@@ -10,6 +10,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +20,16 @@ from otolith.acquisition.quality import is_of_calendar, time_text
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
+from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, RecordedMachine
 from otolith.machine_file import DriverConfig, driver_configs, signal_units
 from otolith.runtime.worker import perform
-from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
+from otolith.storage.recording_files import MIN_FREE_BYTES, recording_file, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
 from otolith_drivers.replay.readers import JoinedReader, MergedReader, Reader, Rows, format_of, holds_frames
+from otolith_drivers.replay.span import SpanReader
 from otolith_drivers.user_dirs import writable
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -58,7 +61,7 @@ def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
         needed = '[driver] with type = "can" and [signals] must describe its frames'
         raise ConfigurationError(f"{data}: a log of a CAN bus, and in {machine.path} {needed}")
     if not has_frames and kind != "replay":
-        return _open_by_name(machine, data, (*machine.twin.signals, *machine.observed))
+        return open_by_name(machine, data, (*machine.twin.signals, *machine.observed))
     (config,) = driver_configs(machine.file, machine.twin, read(machine.path))
     return _open_as(machine, data, config)
 
@@ -90,7 +93,7 @@ def _open_as(machine: LoadedMachine, data: Path, config: DriverConfig) -> Reader
     if has_frames and kind != "replay":
         raise ConfigurationError(f"{data}: a log of a CAN bus, but source {config.name!r} has type = {kind!r}")
     if kind != "replay" or (not has_frames and format_of(data) is not format_of(config.options.file)):
-        return _open_by_name(machine, data, config.signals)
+        return open_by_name(machine, data, config.signals)
     from otolith_drivers.replay.driver import opener  # noqa: PLC0415 - only for a machine file that names it
 
     with config.located_errors():
@@ -104,8 +107,32 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
     return JoinedReader(files, lambda path: open_recorded(machine, path))
 
 
-def _open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> Reader:
-    """Open a table or recording whose columns have the ``names`` of signals; observed ones may be missing."""
+def open_span(machine: LoadedMachine, begin: float, end: float) -> Reader:
+    """Open what the daemon of ``machine`` has recorded from ``begin`` to ``end`` (Unix s).
+
+    Raises:
+        ConfigurationError: nothing of that time was kept, or a recording cannot be used.
+    """
+    names, folder = machine.file.machine, machine.recording_folder
+    known = [recording_file(path) for path in folder.glob("*.rrd")]
+    own = [file for file in known if file is not None and file.key == f"{names.site}.{names.name}"]
+    files = [(file.begin, file.path) for file in own if file.begin <= end and file.end >= begin]
+    if not files:
+        when = partial(moment_text, zone=machine.plan.timezone)
+        newest = max((file.end for file in own), default=None)
+        until = "there is none of it" if newest is None else f"what is written ends at {when(newest)}"
+        remedy = "some minutes are written at a time, and [recording] says for how long they are kept"
+        span = f"from {when(begin)} to {when(end)}"
+        raise ConfigurationError(f"{folder}: no recording of {names.name} {span}: {until}: {remedy}")
+    return SpanReader(open_recordings(machine, [path for _, path in sorted(files)]), begin, end)
+
+
+def open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> Reader:
+    """Open a table or recording whose columns have the ``names`` of signals; observed ones may be missing.
+
+    Raises:
+        ConfigurationError: the file cannot be used, or lacks one of the signals.
+    """
     data_format, units = format_of(data), signal_units(machine.file, machine.twin)
 
     def opened(wanted: Sequence[str]) -> Reader:

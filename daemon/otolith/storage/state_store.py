@@ -228,6 +228,11 @@ class StateStore:
         warm, other = self.restore(state)
         return warm, f"{note}; {other or f'used is what was saved before it, at {saved:%F %T} UTC'}"
 
+    def peek(self, state: AdaptationState) -> tuple[AdaptationState, str]:
+        """Return the same as :meth:`restore`, without the lock and without a change of any file."""
+        known, reason, _ = self._restored(state)
+        return known, reason
+
     def _restored(self, state: AdaptationState) -> tuple[AdaptationState, str, bool]:
         """Return the state with what was saved, why not all of it is used, and whether the file is damaged."""
         try:

@@ -179,6 +179,18 @@ class Kernel:
         predicted: Array = self._call("simulate", parameters, initial, *excitation.arguments)
         return predicted
 
+    def ensemble(  # noqa: PLR0913, PLR0917 - what a step of the integrator takes
+        self, parameters: Array, states: Array, inputs: Array, following: Array, length: float, substeps: int
+    ) -> tuple[Array, Array]:
+        """Outputs (particles, outputs) at a record, and states (particles, states) at the next one, ``length`` s later.
+
+        Shapes (particles, parameters), (particles, states), and (particles, inputs) at this record and at the next one.
+        A particle that diverges gets values that are not finite.
+        """
+        own = (np.ascontiguousarray(inputs), np.ascontiguousarray(following))
+        outputs, final = self._call("ensemble", parameters, states, *own, float(length), int(substeps))
+        return outputs, final
+
     def sensitivities(
         self,
         parameters: Array,

@@ -61,6 +61,29 @@ def simulate(parameters, initial, inputs, steps, counts, measured, gain):
     return predicted
 """
 
+# One record of many particles, each with inputs of its own: between records a caller disturbs what is uncertain.
+ENSEMBLE = """
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def ensemble(parameters, initial, inputs, following, length, substeps):
+    particles = parameters.shape[0]
+    predicted, final = np.empty((particles, $n_outputs)), np.empty((particles, $n_states))
+    step = length / substeps
+    half, sixth = step / 2.0, step / 6.0
+    for particle in range(particles):
+        $read_parameters
+        $read_own_inputs
+        $y = outputs_($of_outputs_)
+        $store
+        $own_increments
+        for substep in range(substeps):
+            $inputs_at_stages
+            $stage_rates
+            $advance_state
+            $advance_inputs
+        $store_final
+    return predicted, final
+"""
+
 EULER = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def euler(parameters, initial, inputs, sample_period, substeps):
@@ -97,6 +120,18 @@ def advance(code: KernelCode) -> list[str]:
 def simulate(code: KernelCode) -> list[str]:
     """``simulate``: the predictions of a swarm of particles, each with its own parameters and initial state."""
     return code.kernel(SIMULATE, _swarm(code))
+
+
+def ensemble(code: KernelCode) -> list[str]:
+    """``ensemble``: outputs at a record, and the states at the next one, of particles with their own inputs."""
+    blocks: Blocks = {
+        "read_parameters": code.read_parameters("particle, "),
+        "read_own_inputs": [f"{name} = inputs[particle, {index}]" for index, name in enumerate(code.u)],
+        "own_increments": code.input_increments("following[particle, {index}]"),
+        "store": [f"predicted[particle, {index}] = {y}" for index, y in enumerate(code.y)],
+        "store_final": [f"final[particle, {row}] = {x}" for row, x in enumerate(code.x)],
+    }
+    return code.kernel(ENSEMBLE, blocks)
 
 
 def euler(code: KernelCode) -> list[str]:
@@ -416,7 +451,7 @@ def kernel_source(definition: Definition) -> str:
     if definition.base is not None:
         lines += component_functions()
     lines += [*code.functions(), *advance(code), *blank, *simulate(code), *blank]
-    lines += [*sensitivities(code), *blank, *kalman(code), *blank, *euler(code)]
+    lines += [*sensitivities(code), *blank, *kalman(code), *blank, *euler(code), *blank, *ensemble(code)]
     if definition.base is not None:
         lines += [*blank, *linearise(code)]
     return HEAD + "\n".join(lines) + "\n"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
@@ -92,21 +92,9 @@ class HealthySpan:
 
     def opened(self, machine: "LoadedMachine") -> "Reader":
         """See :class:`HealthyData`."""
-        from otolith.runtime.replay import open_recordings
-        from otolith.storage.recording_files import recording_file
-        from otolith_drivers.replay.span import SpanReader
+        from otolith.runtime.replay import open_span
 
-        names, zone = machine.file.machine, machine.plan.timezone
-        known = [recording_file(path) for path in self.path.glob("*.rrd")]
-        own = [file for file in known if file is not None and file.key == f"{names.site}.{names.name}"]
-        files = [(file.begin, file.path) for file in own if file.begin <= self.end and file.end >= self.begin]
-        if not files:
-            newest = max((file.end for file in own), default=None)
-            until = "there is none of it" if newest is None else f"what is written ends at {local_time(newest, zone)}"
-            remedy = "some minutes are written at a time, and [recording] says for how long they are kept"
-            span = f"from {local_time(self.begin, zone)} to {local_time(self.end, zone)}"
-            raise ConfigurationError(f"{self.path}: no recording of {names.name} {span}: {until}: {remedy}")
-        return SpanReader(open_recordings(machine, [path for _, path in sorted(files)]), self.begin, self.end)
+        return open_span(machine, self.begin, self.end)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,3 @@
+from otolith.notebook import Twin as Twin
+
+__version__: str

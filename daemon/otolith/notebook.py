@@ -1,0 +1,395 @@
+"""The adapted twin for notebooks: ``from otolith import Twin``. docs/simulate.md shows how it is used.
+
+Nothing here changes what a daemon has learned or writes a file: each method returns a new twin, or numbers.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from otolith.acquisition.quality import is_of_calendar
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.estimation.information import QUANTILE
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import amplitude_indices, equation, indices
+from otolith.estimation.window_fit import fit_predicted
+from otolith.health.labels import TimeLabels
+from otolith.health.prognosis import forecast, with_baselines
+from otolith.health.times import moment_text
+from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime.replay import Replay, open_recordings
+from otolith.runtime.simulation_inputs import PlannedRows, RecordedStretch, read_inputs, read_recorded
+from otolith.simulation import what_if
+from otolith.simulation.plan import joined, planned_window
+from otolith.simulation.prediction import Prediction
+from otolith.simulation.simulate import simulate
+from otolith.storage.history import MINUTE, RESOLUTIONS, HistoryReader, HistorySample, history_path
+from otolith.storage.state_store import store_of
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.units import quantity_text
+
+MAX_LEAD = 5  # windows of a recording, one of which must be usable. docs/reference/thresholds-runtime.md
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRow:
+    """A parameter of the twin as it is known now."""
+
+    name: str
+    value: float  # In unit
+    sd: float  # Standard deviation, in unit; 0 of one that is given
+    low: float  # Lower end of the 95 % interval, in unit
+    high: float  # Upper end
+    unit: str
+    trend_per_hour: float  # In unit per hour; 0 of one that is given
+    is_estimated: bool  # False of a parameter whose value the machine file or a person gives
+    meaning: str
+
+    def __str__(self) -> str:
+        """Name, value with its 95 % interval, and meaning, in a line."""
+        half = QUANTILE * self.sd if self.sd else None
+        return f"{self.name} = {quantity_text(self.value, self.unit, half)}, {self.meaning}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """A recording beside what the twin predicts from one record to the next."""
+
+    outputs: tuple[str, ...]  # Names of the outputs
+    units: tuple[str, ...]  # Of the outputs
+    times: Array  # (records,) s, as in the recording
+    measured: Array  # (records, outputs) each in its unit; not-a-number where nothing was measured
+    predicted: Array  # (records, outputs) in the same units
+    normalised: Array
+    """(records, outputs) measured minus predicted in standard deviations: independent standard normal deviates, if the
+    twin explains the recording."""
+
+    @property
+    def values(self) -> Array:
+        """(records, outputs) measured minus predicted, each in its unit."""
+        return self.measured - self.predicted
+
+    def rms(self) -> dict[str, float]:
+        """Return the root mean square of the residuals of each output in standard deviations: 1 for noise alone."""
+        present = np.isfinite(self.measured)
+        sums = np.where(present, self.normalised, 0.0) ** 2
+        rms = np.sqrt(sums.sum(axis=0) / np.maximum(present.sum(axis=0), 1))
+        return dict(zip(self.outputs, rms.tolist(), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Twin:
+    """The adapted twin of one machine: its equations, discovered components, parameters with intervals, and state.
+
+    ``Twin.load`` has what a daemon has learned. All values are in the units of the twin file: see
+    :attr:`parameters`, :attr:`inputs` and :attr:`outputs`.
+    """
+
+    machine: LoadedMachine
+    learned: AdaptationState
+    """What was learned of the machine."""
+    posterior: Posterior
+    """The same of parameters and components, with what a person supposes."""
+    labels: TimeLabels = field(default_factory=TimeLabels)
+    supposed: tuple[str, ...] = ()
+    """What a person supposes of the machine, a line each."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Twin":
+        """Return the twin of the machine file at ``path`` with what its daemon has learned until now.
+
+        Without a daemon it is as the machine file describes it: :meth:`adapted` adapts it to recordings.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: the file, or what was learned, cannot be used; it says why.
+        """
+        machine = load_machine(Path(path), with_driver=False)
+        names, store = machine.file.machine, store_of(machine)
+        plan = with_baselines(machine.plan, store.decisions().baselines)
+        state, reason = store.peek(initial_state(names.name, names.site, machine.problem, plan))
+        if reason:
+            raise ConfigurationError(f"{store.components_path}: cannot be used: {reason}")
+        return cls(machine, state, state.posterior, store.labels())
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Unit of each input, by its name."""
+        return {item.name: item.unit for item in self.machine.twin.inputs}
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        """Unit of each output, by its name."""
+        return {item.name: item.unit for item in self.machine.twin.outputs}
+
+    @property
+    def components(self) -> dict[str, str]:
+        """Equation of each discovered component, by its key."""
+        problem, values = self.posterior.problem, self.posterior.start()
+        return {
+            component.key: equation(problem.base_model, component, values[indices(problem, slot)].tolist())
+            for slot, component in enumerate(problem.components)
+        }
+
+    @property
+    def parameters(self) -> tuple[ParameterRow, ...]:
+        """All parameters of the twin, in the order of its file, then those of components."""
+        problem, prior = self.posterior.problem, self.posterior.prior()
+        known, count = dict(problem.known), len(problem.free)
+        free = {item.name: index for index, item in enumerate(problem.free)}
+        rows = []
+        for item in (*problem.base_model.parameters, *(item for item in problem.free if item.name.startswith("_"))):
+            index = free.get(item.name)
+            if index is None:
+                value = known[item.name]
+                rows.append(ParameterRow(item.name, value, 0.0, value, value, item.unit, 0.0, False, item.meaning))
+                continue
+            value, sd = float(prior.mean[index]), float(prior.sd[index])
+            trend, reach = 3600.0 * float(prior.mean[count + index]), QUANTILE * sd
+            name = item.label if item.name.startswith("_") else item.name
+            ends = value - reach, value + reach
+            rows.append(ParameterRow(name, value, sd, *ends, item.unit, trend, sd > 0.0, item.meaning))
+        return tuple(rows)
+
+    @property
+    def time(self) -> float | None:
+        """Unix time of the last record that was learned from, s, or the time in its recording; None without one."""
+        phase = self.posterior.phase
+        return None if phase is None else self.labels.unix(phase.next_start - self._period)
+
+    @property
+    def _period(self) -> float:
+        return self.machine.file.window.sample_period
+
+    def adapted(self, *recordings: str | Path) -> "Twin":
+        """Return the twin after ``recordings``, each in a form that ``otolith replay`` reads.
+
+        It begins with what the machine file states, as a replay does, and not with what this twin has learned.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: a recording cannot be used, or is too short for a window.
+        """
+        with open_recordings(self.machine, [Path(path) for path in recordings]) as reader:
+            replay = Replay(self.machine, reader)
+            for _ in replay.reports():
+                pass
+        return Twin(self.machine, replay.state, replay.state.posterior)
+
+    def at(self, time: float) -> "Twin":
+        """Return the twin with parameters and amplitudes as they were at a Unix ``time`` (s), from its history.
+
+        The history has their intervals, but neither correlations nor trends: trends keep the uncertainty that they have
+        now, around zero. Components that were not in the twin then are left out. The state is that of now.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: there is no history, or no value of that time.
+        """
+        names, posterior = self.machine.file.machine, self.posterior
+        known = _values_at(HistoryReader(history_path(names.site, names.name)), time)
+        for key in self.components:
+            if key not in known:
+                posterior = what_if.without_component(posterior, key)
+        problem, prior = posterior.problem, posterior.prior()
+        amplitudes = {index: problem.components[slot].key for slot, index in enumerate(amplitude_indices(problem))}
+        when = _moment_text(time, self.learned.plan.timezone)
+        for index, item in enumerate(problem.free):
+            if item.name.startswith("_") and index not in amplitudes:
+                continue
+            sample = known.get(amplitudes.get(index, item.name))
+            if sample is None or sample.low is None or sample.high is None:
+                remedy = "'otolith history' shows of which times there are values"
+                raise ConfigurationError(f"no value of {item.label} in the history at {when}: {remedy}")
+            sd, trend = 0.5 * (sample.high - sample.low) / QUANTILE, len(problem.free) + index
+            posterior = posterior.reset_value(index, sample.last, sd).reset_value(trend, 0.0, float(prior.sd[trend]))
+        learned = replace(self.learned, posterior=posterior)
+        return replace(self, learned=learned, posterior=posterior, supposed=(*self.supposed, f"values of {when}"))
+
+    def with_value(self, name: str, value: str | float) -> "Twin":
+        """Return the twin with a parameter known to be ``value``: a number in its unit, or a text like "5.2 ohm"."""
+        posterior = what_if.with_value(self.posterior, name, value)
+        row = next(row for row in self._supposing(posterior, "").parameters if row.name == name)
+        return self._supposing(posterior, f"{name} = {quantity_text(row.value, row.unit)}")
+
+    def without(self, component: str) -> "Twin":
+        """Return the twin without a component, by its key in :attr:`components`, or the begin of it."""
+        return self._supposing(what_if.without_component(self.posterior, component), f"without {component}")
+
+    def at_limit(self) -> "Twin":
+        """Return the twin when its next limit is passed, if the trends in its history go on.
+
+        That is the ACT limit that is passed first, or the WATCH limit where none leads to ACT. The parameter then has
+        the value of the limit; all others keep theirs.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: no parameter is on its way to a limit; it says why of each.
+        """
+        crossings, reasons = [], []
+        for name, quantity in self.learned.plan.parameters.items():
+            history = self.learned.health.histories.get(name, ())
+            if not quantity.limits or not history:
+                reasons.append(f"{name}: {'no estimates yet' if quantity.limits else 'no limits'}")
+                continue
+            found = forecast(quantity, history)
+            reasons += [f"{name}: {found.reason}"] if found.reason else []
+            both = {"ACT": found.act, "WATCH": found.watch}
+            crossings += [(level, item.at, name, item) for level, item in both.items() if item is not None]
+        if not crossings:
+            listed = "; ".join(reasons) or "the machine file has no limits"
+            raise ConfigurationError(f"no parameter is on its way to a limit ({listed}): set a value instead")
+        level, at, name, crossing = min(crossings, key=lambda item: item[:3])  # "ACT" comes first
+        posterior = what_if.with_value(self.posterior, name, crossing.limit)
+        value = quantity_text(crossing.limit, self.learned.plan.parameters[name].unit)
+        when = _moment_text(self.labels.unix(at), self.learned.plan.timezone)
+        return self._supposing(posterior, f"{name} = {value}, its {level} limit, expected at {when}")
+
+    def _supposing(self, posterior: Posterior, line: str) -> "Twin":
+        return replace(self, posterior=posterior, supposed=(*self.supposed, line))
+
+    def simulate(
+        self,
+        inputs: str | Path | Mapping[str, Any] | None = None,
+        *,
+        seed: int = 1,
+        span: tuple[float, float] | None = None,
+    ) -> Prediction:
+        """Return what the twin predicts along ``inputs``, with 95 % bands of the readings.
+
+        ``inputs`` are a table with a column ``t`` (s) and one for each input, in a file or as a mapping from names to
+        sequences of numbers (rows,) in the units of :attr:`inputs`; or a recording, of which ``span`` (s, as its times)
+        may choose a part. Without ``inputs``, ``span`` (Unix s) is of what the daemon has recorded. A plan begins at
+        :attr:`time`. A recording begins with a window that shows the state of the machine, and is predicted from there
+        on.
+
+        The result has ``times`` (records,), ``values``, ``low``, ``high`` and ``measured`` (records, outputs). The same
+        ``seed`` gives the same numbers.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: the inputs cannot be used, or no window was learned from yet.
+        """
+        if inputs is None:
+            if span is None:
+                raise ConfigurationError(
+                    "inputs: give a plan, a recording, or the span of what the daemon has recorded"
+                )
+            return self.simulate_along(read_recorded(self.machine, span), seed=seed)
+        if not isinstance(inputs, Mapping):
+            source = read_inputs(self.machine, Path(inputs), span)
+            return self.simulate_along(source, seed=seed)
+        missing = [name for name in ("t", *self.inputs) if name not in inputs]
+        if missing:
+            raise ConfigurationError(f"inputs: {missing[0]} is missing: the plan needs t, {', '.join(self.inputs)}")
+        columns = {name: np.asarray(inputs[name], dtype=np.float64) for name in ("t", *self.inputs)}
+        times = columns.pop("t")
+        for name, column in columns.items():
+            if column.shape != times.shape or times.ndim != 1:
+                raise ConfigurationError(f"inputs: {name} has shape {column.shape}, but t has {times.shape}")
+            if not np.isfinite(column).all():
+                raise ConfigurationError(
+                    f"inputs: {name} is not finite in row {np.flatnonzero(~np.isfinite(column))[0]}"
+                )
+        if not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
+            raise ConfigurationError("inputs: t must rise from row to row, in s")
+        return self.simulate_along(PlannedRows(Path("inputs"), times, columns), seed=seed)
+
+    def simulate_along(self, source: PlannedRows | RecordedStretch, *, seed: int = 1) -> Prediction:
+        """Return the same as :meth:`simulate` for inputs that were read; raises as it."""
+        posterior = self.posterior
+        try:
+            if isinstance(source, PlannedRows):
+                phase = posterior.phase
+                start = 0.0 if phase is None else phase.next_start - self._period
+                window = planned_window(self.machine.twin, source.times, source.columns, self._period, start)
+                prediction, begin = simulate(posterior, window, seed), float(source.times[0])
+            else:
+                posterior, window, begin = self._after_lead(source)
+                prediction = simulate(posterior, window, seed)
+        except ValueError as error:
+            remedy = "run the daemon, or adapt the twin to a recording" if posterior.phase is None else "see its values"
+            raise ConfigurationError(f"{source.path}: {error}: {remedy}") from error
+        return replace(prediction, start=begin)
+
+    def _after_lead(self, stretch: RecordedStretch) -> tuple[Posterior, Window, float]:
+        """Return the posterior after the first usable window of a recording, the rest, and the time of its begin.
+
+        What a person supposes holds in the rest. A recording that is not after what was learned counts as if it were:
+        phases of components are then unknown before the first window.
+        """
+        state, first, end = self.learned, stretch.windows[0], self.posterior.belief.end
+        by = -self.labels.ahead(end) if np.isfinite(end) else 0.0
+        if np.isfinite(end) and first.start + by < end - 0.5 * first.sample_period:
+            by = end + first.grid.length - first.start
+        windows = [replace(window, start=window.start + by) for window in stretch.windows]
+        for index, window in enumerate(windows[: min(MAX_LEAD, len(windows) - 1)]):
+            state, _ = adapt(state, window)
+            phase = state.posterior.phase
+            if phase is not None and phase.last_state and abs(phase.next_start - window.end) < window.sample_period:
+                rest = joined([window.since(window.records - 1), *windows[index + 1 :]])
+                return self._supposed_of(state.posterior), rest, rest.start - by
+        raise ConfigurationError(
+            f"{stretch.path}: the first {MAX_LEAD} windows cannot be used, so the state of the machine is not known: "
+            "'otolith check' shows why"
+        )
+
+    def _supposed_of(self, posterior: Posterior) -> Posterior:
+        """Return a later posterior of the same machine with what a person supposes."""
+        own, before = self.posterior, self.learned.problem
+        kept = {item.key for item in own.problem.components}
+        for key in [item.key for item in before.components if item.key not in kept]:
+            if key in {item.key for item in posterior.problem.components}:
+                posterior = what_if.without_component(posterior, key)
+        prior, known = own.prior(), dict(before.known)
+        values = {name: value for name, value in own.problem.known if known.get(name, value) != value}
+        for index, item in enumerate(own.problem.free):
+            if prior.covariance[index, index] == 0.0:
+                values[item.name] = float(prior.mean[index])
+        for name, value in values.items():
+            posterior = what_if.with_value(posterior, name, value)
+        return posterior
+
+    def residuals(self, recording: str | Path) -> Residuals:
+        """Return measured and predicted outputs of a ``recording``, from each record to the next one.
+
+        In each window the state at its begin is estimated, and parameters stay within what is known of them.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: the recording cannot be used.
+        """
+        source = read_inputs(self.machine, Path(recording))
+        if isinstance(source, PlannedRows):
+            raise ConfigurationError(f"{recording}: has not all outputs of the twin: {', '.join(self.outputs)}")
+        posterior, parts, names = self.posterior, [], tuple(self.outputs)
+        for window in source.windows:
+            end = posterior.belief.end if np.isfinite(posterior.belief.end) else window.end
+            here = replace(window, start=end - window.grid.length)
+            fitted = fit_predicted(posterior.predict(here), posterior.problem, here)
+            predicted, _ = fitted.predict()
+            parts.append((window.start + window.grid.offsets, window.measured(names), predicted, fitted.innovations))
+        times, measured, predicted, normalised = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Residuals(names, tuple(self.outputs.values()), times, measured, predicted, normalised)
+
+    def __str__(self) -> str:
+        """Machine, parameters and components, a line each."""
+        lines: Sequence[str] = [self.machine.title, *map(str, self.parameters)]
+        components = [f"{key}: {text}" for key, text in self.components.items()]
+        return "\n".join([*lines, *components, *(f"supposed: {line}" for line in self.supposed)])
+
+
+def _moment_text(seconds: float, zone: str | None) -> str:
+    """Return a Unix time in a zone, or the time of a log without dates."""
+    return moment_text(seconds, zone) if is_of_calendar(seconds) else f"t = {seconds:.6g} s"
+
+
+def _values_at(reader: HistoryReader, time: float) -> dict[str, HistorySample]:
+    """Return the value of each parameter, and of each amplitude by the key of its component, that held at ``time``.
+
+    Of each the finest resolution that is kept counts; raises as the reader.
+    """
+    found: dict[str, HistorySample] = {}
+    for resolution in RESOLUTIONS:
+        samples = reader.samples(resolution, time - (resolution or MINUTE))  # the time of a window is its end
+        found = {sample.name: sample for sample in samples if sample.time <= time} | found
+    return found

@@ -1,0 +1,71 @@
+"""Draws of what is uncertain in a prediction: parameters with their trends, and how they go on.
+
+Draws come in pairs with opposite deviations, so that their mean is that of the posterior to second order.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.estimation.imm_filter import TREND_NOISE, process_model
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import indices
+
+PAIRS = 200  # Of draws: the ends of a band are exact to 5 % of its width. docs/reference/thresholds-simulation.md
+
+
+def opposite(deviates: Array) -> Array:
+    """Return ``deviates`` (pairs, ...), and their negatives after them."""
+    return np.concatenate([deviates, -deviates])
+
+
+def root_of(covariance: Array) -> Array:
+    """Return a matrix whose product with its transpose is ``covariance`` (..., n, n), which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+@dataclass(slots=True, eq=False)
+class ParameterDraws:
+    """Free parameters of the draws; :meth:`advance` moves them along their trends."""
+
+    values: Array  # (draws, free), each in its unit
+    _trends: Array  # (draws, free) per second
+    _trend_noise: Array  # (draws, free) process noise of each trend, per s^1.5 in the unit; 0 for what stays constant
+    _bounds: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, posterior: Posterior, random: np.random.Generator) -> "ParameterDraws":
+        """Draw from ``posterior``: a mode of the filter by its probability, then values and trends in it.
+
+        Phases and inner parameters of components have no trend here: a phase is what the frequency makes of it.
+        """
+        problem, belief = posterior.problem, posterior.belief
+        free, size = len(problem.free), np.concatenate([problem.scale, problem.scale])
+        shares = (np.arange(PAIRS) + 0.5) / PAIRS
+        mode = np.minimum(np.searchsorted(np.cumsum(belief.weight), shares), len(belief.weight) - 1)
+        deviates = random.standard_normal((PAIRS, 2 * free))
+        deviations = np.einsum("pij,pj->pi", root_of(belief.covariance)[mode], deviates)
+        drawn = (np.tile(belief.mean[mode], (2, 1)) + opposite(deviations)) * size
+        noise = np.tile(TREND_NOISE[belief.level[mode]], (2, 1)) * problem.scale
+        held = [index for slot in range(len(problem.components)) for index in indices(problem, slot)[1:]]
+        fixed = [index for index in range(free) if not belief.covariance[:, index, index].any()]  # a person has set it
+        trends = drawn[:, free:]
+        trends[:, held + fixed] = noise[:, held + fixed] = 0.0
+        values = np.clip(drawn[:, :free], *problem.bounds)
+        return cls(values, trends, noise, problem.bounds)
+
+    def advance(self, seconds: float, random: np.random.Generator) -> None:
+        """Move all draws by ``seconds``.
+
+        Whether a trend decays as the filter lets it, or goes on, is not known: it goes on in every second pair.
+        """
+        (_, run), (_, fade) = process_model(seconds)[0]
+        root = root_of(process_model(seconds)[1])
+        deviates = opposite(random.standard_normal((PAIRS, self.values.shape[1], 2)) @ root.T)
+        noise = self._trend_noise[..., None] * deviates
+        goes_on = np.tile(np.arange(PAIRS) % 2 == 1, 2)[:, None]
+        moved = self.values + np.where(goes_on, seconds, run) * self._trends + noise[..., 0]
+        self._trends = np.where(goes_on, 1.0, fade) * self._trends + noise[..., 1]
+        self.values = np.clip(moved, *self._bounds)

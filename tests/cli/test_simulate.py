@@ -1,0 +1,183 @@
+"""``otolith simulate`` and the API for notebooks: tables, page and JSON agree, and each wrong input gets one line."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from otolith import Twin
+from otolith.adaptation.state import AdaptationState
+from otolith.machine import load_machine
+from otolith.storage.history import history_directory
+from otolith.storage.log_history import log_history
+from otolith_drivers.errors import ConfigurationError
+from tests.cli.commands import otolith
+from tests.messages import assert_says, raises_saying
+from tests.simulation.recorded_motor import PLAN, save_learned, write_files
+from tests.storage.histories import document
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    file = write_files(tmp_path)
+    save_learned(file)
+    return file
+
+
+def test_table_parquet_and_json_have_the_same_numbers(machine: Path) -> None:
+    plan, table, parquet = (machine.with_name(name) for name in ("plan.csv", "out.csv", "out.parquet"))
+    wanted = ("--csv", table, "--parquet", parquet, "--json", "--seed", 5)
+    document = json.loads(otolith("simulate", machine, "--inputs", plan, *wanted).stdout)
+    with table.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    columns = pq.read_table(parquet).to_pydict()
+    speed = document["outputs"]["omega"]
+    assert document["schema"] == "otolith.simulation/1"
+    assert len(document["t"]) == len(rows) == 251
+    for key, curve in (("omega [rad/s]", "value"), ("omega low [rad/s]", "low"), ("omega high [rad/s]", "high")):
+        assert [float(row[key]) for row in rows] == columns[key] == speed[curve]
+    assert all(map(math.isfinite, speed["low"]))
+    assert columns["T_load [N*m]"][0] == pytest.approx(0.02)
+    assert columns["V_a [V]"][99:101] == [12.0, 24.0]
+
+
+def test_the_page_shows_outputs_with_bands_and_inputs(machine: Path) -> None:
+    page = machine.with_name("out.html")
+    text = otolith("simulate", machine, "--inputs", machine.with_name("tuesday.csv"), "--report", page).stdout
+    content = page.read_text(encoding="utf-8")
+    assert content.count("<polygon") == 2
+    assert content.count("<svg") == 4
+    assert "nan" not in content.lower().replace("nano", "")
+    assert len(content) < 300_000
+    assert_says(text, "omega", "rad/s", "%")
+
+
+def test_a_recording_is_predicted_after_its_first_window(machine: Path) -> None:
+    predicted = Twin.load(machine).simulate(machine.with_name("tuesday.csv"))
+    assert predicted.times[0] == pytest.approx(7.99)
+    sd = (predicted.high - predicted.low) / (2.0 * 1.96)
+    deviates = (predicted.measured - predicted.values) / sd
+    assert np.sqrt(np.mean(deviates**2, axis=0)) == pytest.approx(1.0, abs=0.3)
+    for name in predicted.outputs:
+        assert 0.9 < (predicted.coverage(name) or 0.0) <= 1.0
+
+
+def test_what_is_supposed_changes_the_prediction(machine: Path) -> None:
+    twin = Twin.load(machine)
+    limit, higher = twin.at_limit(), twin.with_value("R_a", "7000 mohm")
+    assert limit.parameters[0].value == pytest.approx(0.95 * 6.5)
+    assert_says(str(limit), "R_a", "ACT")
+    slow, now = (each.simulate(machine.with_name("plan.csv")) for each in (higher, twin))
+    assert slow.values[-1, 1] < now.values[-1, 1] - 1.0
+    measured = higher.simulate(machine.with_name("tuesday.csv"))
+    assert (measured.rmse("omega") or 0.0) > 0.1
+    assert twin.supposed == ()
+
+
+def test_the_values_of_an_earlier_time_come_from_the_history(machine: Path) -> None:
+    names, begin = load_machine(machine, with_driver=False).file.machine, 1_700_000_000.0
+    with log_history(history_directory(), names.site, names.name) as history:
+        for index, value in enumerate((6.4, 6.3)):
+            report = document(index, begin + 3600.0 * index, value)
+            history.add(report.model_copy(update={"machine": names.name, "site": names.site}))
+        history.describe("{}")
+    then = Twin.load(machine).at(begin + 60.0)
+    assert then.parameters[0].value == pytest.approx(6.4)
+    assert then.parameters[0].sd == pytest.approx(0.01, rel=0.05)
+    assert then.simulate(machine.with_name("plan.csv")).records == 251
+    with raises_saying(ConfigurationError, "R_a", "history"):
+        Twin.load(machine).at(begin - 100_000.0)
+
+
+def test_residuals_of_a_recording_that_is_explained_are_noise(machine: Path) -> None:
+    residuals = Twin.load(machine).residuals(machine.with_name("tuesday.csv"))
+    assert residuals.rms() == pytest.approx({"i": 1.0, "omega": 1.0}, abs=0.15)
+    np.testing.assert_allclose(residuals.values, residuals.measured - residuals.predicted)
+
+
+def test_loading_a_twin_changes_no_file(machine: Path, tmp_path: Path) -> None:
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    twin = Twin.load(machine)
+    assert isinstance(twin.learned, AdaptationState)
+    assert twin.time == pytest.approx(5.99)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files
+
+
+@pytest.mark.parametrize(
+    ("plan", "options", "parts"),
+    [
+        ("t,V_a\n0,1\n1,2\n", (), ("plan.csv", "T_load")),
+        (PLAN.replace("[V]", "[A]"), (), ("plan.csv", "V_a", "A")),
+        (PLAN.replace("1,24", "1,"), (), ("plan.csv:3", "V_a", "V")),
+        (PLAN.replace("1,24", "1,nan"), (), ("plan.csv:3", "V_a", "V")),
+        (PLAN.replace("1,24", "1,high"), (), ("plan.csv", "line 3", "V_a", "high")),
+        (PLAN.replace("2.5,24", "0.5,24"), (), ("plan.csv:4", "0.5", "1")),
+        (PLAN.replace("2.5,24", "1,24"), (), ("plan.csv:4", "t = 1 s")),
+        ("t,V_a,T_load\n0,12,0\n", (), ("plan.csv", "one row")),
+        ("t,V_a,T_load\n0,12,0\n1e6,12,0\n", (), ("plan.csv", "1000000")),
+        (PLAN, ("--set", "R_x=5"), ("R_x", "R_a")),
+        (PLAN, ("--set", "R_a=5 V"), ("R_a=5 V", "ohm")),
+        (PLAN, ("--set", "R_a=500"), ("R_a=500", "12 ohm")),
+        (PLAN, ("--without", "shaft/periodic"), ("shaft/periodic", "none")),
+        (PLAN, ("--span", "0..1"), ("plan.csv", "span")),
+    ],
+)
+def test_a_wrong_input_gets_one_line(
+    machine: Path, plan: str, options: tuple[str, ...], parts: tuple[str, ...]
+) -> None:
+    machine.with_name("plan.csv").write_text(plan, encoding="utf-8")
+    with raises_saying(ConfigurationError, *parts):
+        otolith("simulate", machine, "--inputs", machine.with_name("plan.csv"), *options)
+
+
+def test_without_a_state_nothing_is_predicted(tmp_path: Path) -> None:
+    machine = write_files(tmp_path)
+    with raises_saying(ConfigurationError, "plan.csv", "window", "daemon"):
+        otolith("simulate", machine, "--inputs", machine.with_name("plan.csv"))
+    with raises_saying(ConfigurationError, "R_a", "estimates"):
+        otolith("simulate", machine, "--inputs", machine.with_name("plan.csv"), "--until-limit")
+
+
+def test_options_that_exclude_each_other_are_a_usage_error(machine: Path) -> None:
+    plan = machine.with_name("plan.csv")
+    for options in ((), ("--inputs", plan, "--json", "--csv", "-"), ("--inputs", plan, "--at", "1d", "--after", plan)):
+        with pytest.raises(click.UsageError):
+            otolith("simulate", machine, *options)
+
+
+def test_a_span_of_which_nothing_was_recorded_is_named(machine: Path) -> None:
+    with raises_saying(ConfigurationError, "dc-motor", "2026-01-31", "there is none"):
+        otolith("simulate", machine, "--span", "2026-01-31T10:00..2026-01-31T10:05")
+
+
+def test_a_file_that_is_not_there_is_named(machine: Path) -> None:
+    with raises_saying(ConfigurationError, "nowhere.csv"):
+        otolith("simulate", machine, "--inputs", machine.with_name("nowhere.csv"))
+
+
+@pytest.mark.parametrize(
+    ("plan", "part"),
+    [
+        ({"t": [0.0, 1.0], "V_a": [1.0, 1.0]}, "T_load"),
+        ({"t": [0.0, 1.0], "V_a": [1.0], "T_load": [0.0, 0.0]}, "V_a"),
+        ({"t": [0.0, 1.0], "V_a": [1.0, math.nan], "T_load": [0.0, 0.0]}, "V_a"),
+        ({"t": [1.0, 0.0], "V_a": [1.0, 1.0], "T_load": [0.0, 0.0]}, "t must rise"),
+    ],
+)
+def test_a_wrong_plan_of_a_notebook_is_named(machine: Path, plan: dict[str, list[float]], part: str) -> None:
+    with raises_saying(ConfigurationError, part):
+        Twin.load(machine).simulate(plan)
+
+
+def test_a_name_that_otolith_does_not_have_is_an_attribute_error() -> None:
+    program = "import otolith, sys; assert not {'numpy', 'numba', 'pydantic'} & set(sys.modules); otolith.Twins"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "AttributeError" in done.stderr
+    assert "Twins" in done.stderr
