@@ -1,5 +1,6 @@
 """The history: what is kept, bounded by age and size with any clock, and a database that cannot be used."""
 
+import json
 import shutil
 import signal
 import sqlite3
@@ -8,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from otolith.storage.history import (
     describe_machine,
 )
 from otolith.storage.history_schema import create
-from otolith.storage.history_writer import AGES, MAX_WAITING, Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import AGES, BATCH, MAX_WAITING, Bounds, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, START, document, documents
@@ -206,7 +207,7 @@ def test_an_interval_has_the_statistics_of_its_windows(values: list[tuple[float,
     create(connection, SITE, MACHINE)
     tables = Tables(connection, 0)
     for index, (time, value) in enumerate(values):
-        tables.add(document(index, START + time, value).model_copy(update={"sequence": index}))
+        tables.merge([document(index, START + time, value).model_copy(update={"sequence": index})])
     for length in (MINUTE, HOUR, DAY):
         expected: dict[float, list[float]] = {}
         for time, value in values:
@@ -588,3 +589,109 @@ def test_rows_that_the_disk_has_damaged_are_left_out(
     assert reader.events(0.0) == events[1:]
     assert (reader.findings(0.0), reader.counters(0.0)) == ([], [])
     assert len(reader.samples(WINDOW, 0.0)) == 200
+
+
+def counted(reader: HistoryReader) -> tuple[int, int]:
+    """How many windows the values of days and of windows are of."""
+    return sum(sample.count for sample in reader.samples(DAY, 0.0)), len(reader.samples(WINDOW, 0.0))
+
+
+def test_values_follow_together_but_reports_at_once(path: Path) -> None:
+    writer, reader = HistoryWriter(path, BOUNDS), HistoryReader(path)
+    numbers, _ = writer.open(START)
+    writer.start()
+    first, *rest = documents(BATCH + 5)  # the one with index 50 raises an event
+    writer.add(numbers.number(first))
+    wait_for(lambda: len(numbers_of(reader)) == 1)
+    for report in rest[:30]:
+        writer.add(numbers.number(report))
+    wait_for(lambda: len(numbers_of(reader)) == 31)
+    assert counted(reader) == (0, 0)
+    for report in rest[30:50]:
+        writer.add(numbers.number(report))
+    wait_for(lambda: len(reader.events(0.0)) == 1)
+    wait_for(lambda: counted(reader) == (51, 51))
+    for report in rest[50:]:
+        writer.add(numbers.number(report))
+    writer.stop(PATIENCE)
+    assert counted(reader) == (BATCH + 5, BATCH + 5)
+
+
+def test_values_of_a_killed_daemon_are_written_once_by_the_next_one(path: Path) -> None:
+    reader = HistoryReader(path)
+    for run, lines in enumerate((1, 6, 2)):
+        process = subprocess.Popen(
+            [sys.executable, "-c", WRITES_FOR_EVER, str(path)], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        for _ in range(lines):
+            process.stdout.readline()
+        process.send_signal(signal.SIGKILL)
+        process.wait(PATIENCE)
+        process.stdout.close()
+        before = len(numbers_of(reader))
+        assert before > counted(reader)[1] or run == 0 or before % BATCH == 0
+        writer = HistoryWriter(path, BOUNDS)
+        writer.open(START + run)
+        ends = {json.loads(text)["window"]["end"] for text in reader.messages("report", 1_000_000)}
+        assert {sample.time for sample in reader.samples(WINDOW, 0.0)} == ends
+        assert sum(sample.count for sample in reader.samples(DAY, 0.0)) == len(numbers_of(reader)) == before
+        writer._close()
+        writer.open(START + run)
+        assert sum(sample.count for sample in reader.samples(DAY, 0.0)) == before
+        writer._close()
+
+
+def test_counters_of_a_killed_daemon_stay_its_own(opened: Callable[..., Simulated]) -> None:
+    first = opened()
+    first.writer.add(first.numbers.number(document(7, START + 2.0)))
+    first.writer._write_reports()
+    assert first.writer._connection is not None
+    with first.writer._connection as connection:  # as a daemon that started earlier and is killed leaves it
+        connection.execute("UPDATE merged SET run = 5")
+    first.writer._close()
+    second = opened()
+    second.write(document(1, START + 4.0))
+    old, new = second.writer.reader.counters(0.0)
+    assert (old["run"], old["windows"], new["windows"]) == (5, 7, 1)
+
+
+def test_a_time_is_found_without_a_walk_through_the_table(
+    opened: Callable[..., Simulated], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The work of a query, in instructions of SQLite, does not depend on how long the history is."""
+    history, steps = opened(), list[int]()
+
+    def counting(connection: sqlite3.Connection) -> None:
+        connection.set_progress_handler(lambda: steps.append(0), 10)
+
+    monkeypatch.setattr("otolith.storage.history.bound", counting)
+
+    def work(kind: str, begin: float, end: float, found: int) -> int:
+        steps.clear()
+        assert len(history.writer.reader.messages(kind, 1000, 0, begin, end)) == found
+        return len(steps)
+
+    reports = iter(documents(6000))
+    for _ in range(2):
+        history.write(*islice(reports, 200))
+    short = {kind: work(kind, START + 700.0, START + 760.0, found) for kind, found in (("report", 31), ("event", 1))}
+    while batch := list(islice(reports, 200)):
+        history.write(*batch)
+    assert history.writer.dropped == 0
+    for kind, found in (("report", 31), ("event", 1)):
+        for begin in (START + 700.0, START + 11_700.0):
+            assert work(kind, begin, begin + 60.0, found) < 2 * short[kind]
+
+
+def test_each_window_writes_little(opened: Callable[..., Simulated], path: Path) -> None:
+    """A minute of windows writes its values once; the log has all that was written."""
+    history, noise = opened(), np.random.default_rng(1)
+    assert history.writer._connection is not None
+    history.writer._connection.execute("PRAGMA wal_autocheckpoint = 0").fetchall()
+    for report in documents(300):
+        padded = report.model_copy(update={"notes": (noise.bytes(600).hex(),), "events": ()})
+        history.writer.add(history.numbers.number(padded))
+        history.writer._merged_at = 0.0
+        history.writer._write_waiting(59.0 if report.window.index % 30 else 60.0)
+    assert path.with_name(f"{path.name}-wal").stat().st_size / 300 < 8_500

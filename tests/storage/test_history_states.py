@@ -49,6 +49,7 @@ def kept(path: Path, reports: Sequence[ReportDocument], restart: int) -> History
         tables = Tables(connection, number) if number == restart else tables
         with connection:
             tables.add(report)
+            tables.merge([report])
     connection.close()
     return HistoryReader(path)
 

@@ -59,7 +59,7 @@ FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
 DAMAGES = (zlib.error, ValueError, TypeError, LookupError, RecursionError)
 
 # By sequence: versions without labels wrote the time of a wrong clock.
-_SINCE = "WHERE sequence >= (SELECT min(sequence) FROM event WHERE time >= ?)"
+_SINCE = "WHERE sequence >= (SELECT min(+sequence) FROM event WHERE time >= ?)"  # '+': by the index of time
 _SAMPLE = """
 INSERT INTO sample VALUES (?, ?, ?, 1, ?4, ?4, ?4, ?4, ?5, ?6, ?7) ON CONFLICT DO UPDATE SET
     count = count + 1, min = min(min, excluded.min), mean = mean + (excluded.mean - mean) / (count + 1),
@@ -178,20 +178,45 @@ class Tables:
             self._labels = labels
 
     def add(self, document: ReportDocument) -> None:
-        """Write a report with service times: its values, findings and counters, and states and events that changed."""
+        """Write a report with service times, and the events that it changed; :meth:`merge` writes the rest."""
         execute, end = self._connection.execute, document.window.end
         text = zlib.compress(document.to_json().encode(), COMPRESSION)
         execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, text))
+        for event in document.events:
+            if event.change is not None:
+                row = (event.sequence, end, event.json_line())
+                execute("INSERT OR REPLACE INTO event VALUES (?, ?, ?)", row)
+
+    def merge(self, documents: Iterable[ReportDocument]) -> None:
+        """Write values, states, findings and counters of reports that were added, in their order.
+
+        They change the same pages of the file each time, so that many reports together write little more than one.
+        """
+        for document in documents:
+            self._merge(document)
+            self._connection.execute("UPDATE merged SET sequence = ?, run = ?", (document.sequence or 0, self._run))
+
+    def begin(self) -> None:
+        """Note the ``run`` of the reports to come, for :meth:`unmerged`."""
+        self._connection.execute("UPDATE merged SET run = ?", (self._run,))
+
+    def unmerged(self) -> tuple[list[ReportDocument], int]:
+        """Return the reports that a daemon added before it was killed, and its ``run``; without damaged ones."""
+        execute, unpacked, reports = self._connection.execute, Unpacker(), list[ReportDocument]()
+        later = "sequence > (SELECT sequence FROM merged)"
+        for (text,) in execute(f"SELECT text FROM report WHERE {later} ORDER BY sequence"):  # noqa: S608 - our own text
+            with contextlib.suppress(*DAMAGES, ConfigurationError):
+                reports.append(ReportDocument.from_json(unpacked(text)))
+        return reports, int(execute("SELECT run FROM merged").fetchone()[0])
+
+    def _merge(self, document: ReportDocument) -> None:
+        execute, end = self._connection.execute, document.window.end
         for name, parameter in document.parameters.items():
             self._add_value(name, end, parameter, parameter.status)
         for component in document.components:
             self._add_value(component.id, end, component.values["amplitude"], component.status)
         if (health := document.health) is not None:
             self._add_states({"": health, **health.parts}, document.sequence or 0, end)
-        for event in document.events:
-            if event.change is not None:
-                row = (event.sequence, end, event.json_line())
-                execute("INSERT OR REPLACE INTO event VALUES (?, ?, ?)", row)
         for finding in document.findings:
             text_of = finding.json_line()
             known = execute(
@@ -409,13 +434,15 @@ class HistoryReader:
 
         They have a sequence number above ``after``, and their windows end from ``start`` to ``end``.
         """
-        query = (
-            f"SELECT text FROM {'event' if kind == 'event' else 'report'} "  # noqa: S608 - no text of a user
-            "WHERE sequence > ?1 AND (?2 IS NULL OR time >= ?2) AND (?3 IS NULL OR time <= ?3) "
-            "ORDER BY sequence LIMIT ?4"
-        )
-        labels, unpacked = self.labels(), Unpacker()
-        begin, until = start and labels.first(start), end and labels.last(end)
+        table, labels, unpacked = "event" if kind == "event" else "report", self.labels(), Unpacker()
+        begin = -math.inf if start is None else labels.first(start)
+        until = math.inf if end is None else labels.last(end)
+        # '+': the numbers bound the rows that are read, and the index of time has the numbers.
+        numbers = f"FROM {table} WHERE time BETWEEN ?2 AND ?3"
+        lower = "?1" if start is None else f"max(?1, (SELECT min(+sequence) {numbers}) - 1)"
+        upper = "" if end is None else f"AND sequence <= (SELECT max(+sequence) {numbers})"
+        among = f"sequence > {lower} {upper} AND +time BETWEEN ?2 AND ?3"
+        query = f"SELECT text FROM {table} WHERE {among} ORDER BY sequence LIMIT ?4"  # noqa: S608 - as above
         rows = self._rows(query, after, begin, until, limit)
 
         def published(row: bytes | str) -> str:

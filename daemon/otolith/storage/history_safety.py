@@ -32,10 +32,13 @@ def bound(connection: sqlite3.Connection) -> None:
         connection.execute(f"PRAGMA {pragma}").fetchall()
 
 
-def check_tables(connection: sqlite3.Connection) -> None:
-    """Check that a database has nothing but tables that are stored; raise ValueError if something is computed."""
+def check_tables(connection: sqlite3.Connection, indexes: frozenset[tuple[str, str]]) -> None:
+    """Check that a database has nothing but tables that are stored, and ``indexes`` (name and statement).
+
+    Raises ValueError if something is computed.
+    """
     for kind, name, text in connection.execute("SELECT type, name, sql FROM sqlite_master"):
-        is_own = kind == "index" and text is None  # of a primary key
+        is_own = kind == "index" and (text is None or (name, text) in indexes)  # None: of a primary key
         is_virtual = kind == "table" and str(text)[:20].upper().startswith("CREATE VIRTUAL")
         if is_virtual or not (kind == "table" or is_own):
             raise ValueError(

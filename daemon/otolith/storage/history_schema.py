@@ -8,7 +8,7 @@ from typing import Literal
 
 from otolith.storage.history_safety import check_tables
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
 PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
 
@@ -39,6 +39,14 @@ _DESCRIPTION = "CREATE TABLE {place}.description (text TEXT NOT NULL)"
 _LABEL = "CREATE TABLE {place}.label (begin REAL PRIMARY KEY, ahead REAL NOT NULL)"  # See otolith.health.labels
 
 
+_MERGED = "CREATE TABLE merged (sequence INTEGER NOT NULL, run INTEGER NOT NULL)"  # See Tables.merge
+_INDEXES = {
+    "report_time": "CREATE INDEX report_time ON report (time)",
+    "event_time": "CREATE INDEX event_time ON event (time)",
+}
+"""By name, as SQLite keeps their statements."""
+
+
 class NewerVersionError(ValueError):
     """A later version of Otolith wrote the database."""
 
@@ -50,9 +58,11 @@ def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute("PRAGMA journal_mode = WAL")
     later = "; ".join(table.format(place="main") for table in (_STATE, _DESCRIPTION, _LABEL))
+    later = "; ".join((later, _MERGED, *_INDEXES.values()))
     connection.executescript(f"BEGIN; {_SCHEMA}{later}; PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
     with connection:
         connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
+        connection.execute("INSERT INTO merged VALUES (0, 0)")
 
 
 def check(connection: sqlite3.Connection) -> tuple[str, str]:
@@ -72,7 +82,7 @@ def check(connection: sqlite3.Connection) -> tuple[str, str]:
         raise NewerVersionError(f"{newer}: install the newer Otolith again, or move the file away")
     if version < 1:
         raise ValueError(f"version {version} of the format: this Otolith reads 1 to {SCHEMA_VERSION}")
-    check_tables(connection)
+    check_tables(connection, frozenset(_INDEXES.items()))
     rows = connection.execute("SELECT site, machine FROM identity LIMIT 2").fetchall()
     if len(rows) != 1 or not all(isinstance(name, str) for name in rows[0]):
         raise ValueError("it is not of one machine")
@@ -130,5 +140,14 @@ def _from_2(connection: sqlite3.Connection, place: Place) -> None:
     connection.execute(_LABEL.format(place=place))
 
 
-_UPGRADES: dict[int, Callable[[sqlite3.Connection, Place], None]] = {1: _from_1, 2: _from_2}
+def _from_3(connection: sqlite3.Connection, place: Place) -> None:
+    """Version 3 had no index by time, and wrote the values of a report together with it."""
+    if place == "main":  # a reader does without
+        connection.execute(_MERGED)
+        connection.execute("INSERT INTO merged SELECT coalesce(max(sequence), 0), 0 FROM report")
+        for statement in _INDEXES.values():
+            connection.execute(statement)
+
+
+_UPGRADES: dict[int, Callable[[sqlite3.Connection, Place], None]] = {1: _from_1, 2: _from_2, 3: _from_3}
 """By the version that they upgrade to the next one."""

@@ -44,7 +44,8 @@ DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 NUMBER_LEAP = 4000  # numbers skipped at a start: more than a daemon publishes without saving
 MAX_WAITING = 256  # reports that wait for the disk
-BATCH = 64  # reports in one transaction
+BATCH = 64  # reports in one transaction, and from which on their values are written
+MERGE_INTERVAL = 60.0  # s from the first report to the transaction with its values
 PRUNE_INTERVAL = 60.0  # s between two deletions by age
 MAX_LOG_BYTES = 32 << 20  # of the write-ahead log, which a reader that never ends keeps from being merged
 QUERY_WAIT = 1.0  # s that a query waits for what is not yet written
@@ -83,8 +84,8 @@ class Retention:
                 pass
         # By sequence: reports with the time of a wrong clock, ahead or behind, go with those around them.
         resend = first(clock - min(self._bounds.resend_hours * HOUR, longest))
-        recent = "coalesce((SELECT min(sequence) FROM report WHERE time BETWEEN ?1 AND ?2), 9e18)"
-        latest = f"(SELECT max(sequence) FROM report WHERE time < ?1 AND sequence < {recent})"  # noqa: S608 - our own names
+        recent = "coalesce((SELECT min(+sequence) FROM report WHERE time BETWEEN ?1 AND ?2), 9e18)"  # '+': by time
+        latest = f"(SELECT max(+sequence) FROM report WHERE time < ?1 AND +sequence < {recent})"  # noqa: S608 - our own names
         while self._delete_reports(f"sequence <= {latest}", resend, first(clock + MAX_AHEAD)):
             pass
         for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour")):
@@ -218,6 +219,8 @@ class HistoryWriter(WriterThread):
         self._path, self._bounds = path, bounds
         self._connection: sqlite3.Connection | None = None
         self._waiting: deque[ReportDocument] = deque()
+        self._unmerged: list[ReportDocument] = []  # Reports that are written, without their values
+        self._merged_at = 0.0
         self._lock, self._written = threading.Lock(), threading.Event()
         self._pruned_at, self._read_error = 0.0, ""
         self.description = ""
@@ -240,7 +243,7 @@ class HistoryWriter(WriterThread):
 
     def start(self) -> None:
         """Start the thread that writes."""
-        self._pruned_at = time.monotonic()
+        self._pruned_at = self._merged_at = time.monotonic()
         super().start()
 
     def add(self, document: ReportDocument) -> None:
@@ -278,7 +281,12 @@ class HistoryWriter(WriterThread):
             return []
 
     def write(self) -> None:
-        """Write what is waiting, and delete what is too old or too much; the last call closes the database."""
+        """Write what is waiting, and delete what is too old or too much; the last call closes the database.
+
+        Reports and events are written at once: they are exactly what was published, also after a kill. Values, states,
+        findings and counters follow once in ``MERGE_INTERVAL``, with an event and at the end. They follow from the
+        reports, so those of a daemon that was killed are written by the next one.
+        """
         try:
             self._work(time.monotonic())
         finally:
@@ -300,7 +308,7 @@ class HistoryWriter(WriterThread):
         self._limit_log()
         self._retention.labels = self.labels
         try:
-            self._write_waiting()
+            self._write_waiting(now)
         except sqlite3.Error as error:
             if _code(error) in DAMAGED:
                 log.warning("%s", self._begin_anew(str(error)))
@@ -308,13 +316,32 @@ class HistoryWriter(WriterThread):
                 self._retention.by_size(time.time())
             else:
                 raise
-            self._write_waiting()
+            self._write_waiting(now)
         self._retention.by_size(time.time())
         if now - self._pruned_at >= PRUNE_INTERVAL:
             self._retention.by_age(time.time(), now - self._pruned_at)
             self._pruned_at = now
 
-    def _write_waiting(self) -> None:
+    def _write_waiting(self, now: float = math.inf) -> None:
+        """Write what is waiting, and the values of what is written if they are due at ``now`` (monotonic, s)."""
+        self._write_reports()
+        is_urgent = self._stopping.is_set() or any(event.change for report in self._unmerged for event in report.events)
+        is_due = len(self._unmerged) >= BATCH or now - self._merged_at >= MERGE_INTERVAL
+        if self._unmerged and (is_urgent or is_due):
+            self._merge()
+            self._merged_at = time.monotonic()
+
+    def _merge(self) -> None:
+        assert self._connection is not None  # noqa: S101 - for mypy
+        try:
+            with self._connection:
+                self._tables.merge(self._unmerged)
+        except BaseException:
+            self._tables.forget_series()
+            raise
+        self._unmerged = []
+
+    def _write_reports(self) -> None:
         assert self._connection is not None  # noqa: S101 - for mypy
         while True:
             with self._lock:
@@ -331,6 +358,7 @@ class HistoryWriter(WriterThread):
             except BaseException:
                 self._tables.forget_series()
                 raise
+            self._unmerged += batch
             with self._lock:
                 written = {id(document) for document in batch}
                 while self._waiting and id(self._waiting[0]) in written:
@@ -412,6 +440,11 @@ class HistoryWriter(WriterThread):
         connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()
         connection.execute("PRAGMA journal_size_limit = 0").fetchall()
         self._tables, self._retention = Tables(connection, int(time.time())), Retention(connection, self._bounds)
+        reports, run = self._tables.unmerged()
+        known = {report.sequence for report in self._unmerged}
+        with connection:
+            Tables(connection, run).merge(report for report in reports if report.sequence not in known)
+            self._tables.begin()
 
     def _begin_numbers(self, now: float) -> Numbers:
         """Return where the numbers continue; it is saved before the first of them is published."""

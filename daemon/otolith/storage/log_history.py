@@ -31,7 +31,9 @@ class LogHistory:
         """Write a report; raises as :func:`log_history`."""
         if self._tables is None:  # The counters of a log begin in it, so that none of them count as earlier ones
             self._tables = Tables(self._connection, math.ceil(document.window.start))
-        self._tables.add(self._numbers.number(document))
+        numbered = self._numbers.number(document)
+        self._tables.add(numbered)
+        self._tables.merge([numbered])
         self.span = self.span[0] if self.span else document.window.start, document.window.end
         self._waiting += 1
         if self._waiting >= BATCH:
