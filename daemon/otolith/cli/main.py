@@ -38,6 +38,7 @@ from otolith.cli.common import (
 )
 from otolith.cli.operation.event import event
 from otolith.cli.operation.explain import explain
+from otolith.cli.operation.export import export
 from otolith.cli.operation.history import history, report, reproduce
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
@@ -373,6 +374,7 @@ COMMANDS: tuple[click.Command, ...] = (
     drivers,
     event,
     explain,
+    export,
     history,
     init,
     install,
