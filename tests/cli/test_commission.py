@@ -93,7 +93,7 @@ def test_findings_of_the_replay_are_counted_or_printed(
     frozen = Frozen.model_validate({"kind": "frozen", "start": "6 s", "signal": "ArmatureCurrent"})
     logged(data, scenario.model_copy(update={"faults": (frozen,)}), 14)
     machine = load_machine(file, with_driver=False)
-    commission_module._replayed(machine, HealthyLog(data), Manner(lambda: None, details=details))
+    commission_module._replayed(machine, HealthyLog((data,)), Manner(lambda: None, details=details))
     said = [line for line in capsys.readouterr().err.splitlines() if "window" in line]
     if details:
         assert len(said) > 1

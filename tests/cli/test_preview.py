@@ -13,7 +13,7 @@ from otolith.cli.main import cli
 from otolith.cli.replay import replay
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import Preview, preview_lines, preview_recording, short_lines
-from otolith.runtime.replay import open_recorded
+from otolith.runtime.replay import open_recordings
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Reader
 from tests.cli.replays import MACHINE, Lines, recorded, written
@@ -29,7 +29,7 @@ def previewed(data: Path, window: str = "", max_rows: int | None = None) -> Prev
     machine = data.parent / "machine.toml"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + f"[window]\n{window}\n", encoding="utf-8")
     loaded = load_machine(machine, with_driver=False)
-    return preview_recording(loaded, data, max_rows=max_rows)
+    return preview_recording(loaded, [data], max_rows=max_rows)
 
 
 def retimed(rows: Lines, times: Sequence[float]) -> Lines:
@@ -240,11 +240,11 @@ def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_s
 ) -> None:
     opened: list[Path] = []
 
-    def counting(machine: LoadedMachine, path: Path) -> Reader:
-        opened.append(path)
-        return open_recorded(machine, path)
+    def counting(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
+        opened.extend(files)
+        return open_recordings(machine, files)
 
-    monkeypatch.setattr("otolith.runtime.preview.open_recorded", counting)
+    monkeypatch.setattr("otolith.runtime.preview.open_recordings", counting)
     data = written(tmp_path, rows)
     counts = []
     for window, max_rows in (

@@ -26,8 +26,8 @@ INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, a
 STEP_TIMEOUT, BREAK_INTERVAL = 2.0, 0.5  # s until a step is broken off after a signal; until that is tried again
 PAUSE = 0.05  # s between two looks for a signal
 FILE = click.Path(path_type=Path, dir_okay=False)
-DATA_FILE = click.argument("data", type=FILE)
 DATA_FILES = click.argument("data", type=FILE, nargs=-1, required=True)
+ANY_DATA_FILES = click.argument("data", type=FILE, nargs=-1)
 
 
 def _machine_file(_: click.Context, __: click.Parameter, given: str) -> Path:

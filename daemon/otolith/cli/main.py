@@ -24,6 +24,7 @@ from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
 from otolith.cli.commissioning.twin import twin
 from otolith.cli.common import (
+    ANY_DATA_FILES,
     DATA_FILES,
     FILE,
     INTERRUPTED,
@@ -153,13 +154,13 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
 
 @cli.command()
 @MACHINE_FILE
-@click.argument("data", type=FILE, required=False)
+@ANY_DATA_FILES
 @click.option("--no-device", is_flag=True, help="Do not open the machine's bus.")
 @click.option("--json", "as_json", is_flag=True, help="Print only what DATA offers, as JSON.")
-def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
+def check(file: Path, data: tuple[Path, ...], no_device: bool, as_json: bool) -> int:
     """Explain the machine file FILE, and listen for its signals.
 
-    With DATA, recorded data in a format of 'otolith replay', it opens no bus: it shows rate, jitter, gaps and repeats
+    With DATA, recorded data in formats of 'otolith replay', it opens no bus: it shows rate, jitter, gaps and repeats
     of each signal, which windows can be used, and which parameters they are expected to determine.
 
     \b
@@ -170,7 +171,7 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
     """
     from otolith.cli.commissioning.check import check_data, check_machine
 
-    if data is not None:
+    if data:
         return 0 if check_data(file, data, as_json=as_json) else 1
     if as_json:
         raise click.UsageError("--json needs DATA: it prints what recorded data offer")

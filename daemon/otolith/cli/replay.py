@@ -227,6 +227,6 @@ def _with_decisions(machine: LoadedMachine, state: AdaptationState, directory: P
 def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool]) -> None:
     """Print to standard error what the first rows of ``data`` offer."""
     with suppress(OtolithError):  # the replay itself raises what is wrong with the file
-        preview = preview_recording(machine, data, stopped, max_rows=PREVIEWED_ROWS)
+        preview = preview_recording(machine, [data], stopped, max_rows=PREVIEWED_ROWS)
         for line in short_lines(preview, machine.plan.timezone):
             echo(line, err=True)

@@ -26,7 +26,7 @@ from otolith.estimation.problem import Problem, WindowOptions
 from otolith.estimation.sensor_models import shown_model
 from otolith.health.times import in_local_time
 from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
-from otolith.runtime.replay import Replay, Stopped, open_recorded
+from otolith.runtime.replay import Replay, Stopped, open_recordings
 from otolith.runtime.worker import perform, warm_up
 from otolith_drivers.errors import counted
 from otolith_drivers.units import unit_text
@@ -142,7 +142,7 @@ class Preview:
 
 def preview_recording(
     machine: LoadedMachine,
-    data: Path,
+    data: Sequence[Path],
     stopped: Stopped = lambda: False,
     *,
     max_rows: int | None = None,
@@ -150,7 +150,8 @@ def preview_recording(
 ) -> Preview:
     """Return the preview of ``data``: of its first ``max_rows`` rows, without a proposal and computing times, if given.
 
-    The file is read once, and again for a proposed window. ``progress`` is called from time to time with a text.
+    Each file is a recording of its own. It is read once, and again for a proposed window. ``progress`` is called from
+    time to time with a text.
 
     Raises:
         ConfigurationError: the file cannot be read as the signals of the twin.
@@ -164,7 +165,7 @@ def preview_recording(
     statistics = survey.statistics
     samplings = statistics.signals()
     return Preview(
-        data=str(data),
+        data=", ".join(map(str, data)),
         rows=statistics.rows,
         start=statistics.first if statistics.rows else None,
         end=statistics.last if statistics.rows else None,
@@ -210,12 +211,16 @@ def _proposal(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMa
 
 
 def _survey(
-    machine: LoadedMachine, data: Path, stopped: Stopped, max_rows: int | None, progress: Callable[[str], None]
+    machine: LoadedMachine,
+    data: Sequence[Path],
+    stopped: Stopped,
+    max_rows: int | None,
+    progress: Callable[[str], None],
 ) -> _Survey:
     """Read the data once, and return what they offer to windows as ``machine`` configures them."""
     usable, moving = EvenSpread[Window](MAX_ANALYSED), EvenSpread[Window](MAX_ANALYSED)
     counts, refusals = Counter[str](), ReasonCounts()
-    with open_recorded(machine, data) as reader:
+    with open_recordings(machine, data) as reader:
         sources = tuple(reader.describe())
         run = Replay(machine, reader, stopped)
         for window in run.windows():

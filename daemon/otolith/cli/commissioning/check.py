@@ -53,7 +53,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     return set(machine.twin.signals) <= set(counts)
 
 
-def check_data(path: Path, data: Path, *, as_json: bool) -> bool:
+def check_data(path: Path, data: Sequence[Path], *, as_json: bool) -> bool:
     """Print what the daemon would do with ``data``, and what the data offer: line by line, or the latter as JSON.
 
     Returns:

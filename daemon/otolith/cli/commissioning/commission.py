@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from otolith.cli.commissioning.components import equation_of, key_of_record, loaded
-from otolith.cli.common import FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
+from otolith.cli.common import ANY_DATA_FILES, MACHINE_FILE, echo_warnings, local_time, progress_line
 from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 
@@ -49,7 +49,7 @@ class Manner:
 
 @click.command()
 @MACHINE_FILE
-@click.argument("data", type=FILE, required=False)
+@ANY_DATA_FILES
 @click.option("--last", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE",
               help="Of the machine that runs: it was healthy for so long, like 2h.")  # fmt: skip
 @click.option("--since", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
@@ -62,7 +62,7 @@ class Manner:
 @click.option("--details", is_flag=True, help="Print each finding of the replay, not their number.")
 def commission(
     file: Path,
-    data: Path | None,
+    data: tuple[Path, ...],
     last: Since | None,
     since: Since | None,
     until: Since | None,
@@ -77,8 +77,8 @@ def commission(
     signals. You decide for each component whether it belongs to the machine; afterwards only a change is a finding.
     Its estimates become the baseline of limits in percent.
 
-    The data are DATA, a log; stop the daemon before. Or they are what the daemon has recorded since a time: then it
-    goes on with all that it has learned, and takes over the baseline with its next window.
+    The data are DATA, a log or several; stop the daemon before. Or they are what the daemon has recorded since a time:
+    then it goes on with all that it has learned, and takes over the baseline with its next window.
 
     With --write, parameters that FILE does not state are identified first.
 
@@ -90,13 +90,13 @@ def commission(
       otolith commission my-machine.toml --since 2026-01-31T06:00 --until 2h
     """
     spans = [name for name, given in (("--last", last), ("--since", since), ("--until", until)) if given]
-    if data is not None and spans:
+    if data and spans:
         raise click.UsageError(f"{spans[0]} is of a machine that runs, not of DATA: give one of them")
-    if data is None and not (last or since):
+    if not data and not (last or since):
         raise click.UsageError("which data are of the healthy machine? give DATA, or --last 2h of a machine that runs")
     if last and since:
         raise click.UsageError("--last and --since both say where it begins: give one of them")
-    if data is not None:
+    if data:
         how = Manner((lambda: True) if yes else ask_if_healthy, write=write, details=details)
         commission_log(file, data, windows, how)
         return
@@ -110,8 +110,8 @@ def commission(
     _commission_running(machine, store, (begin, end), windows, how)
 
 
-def commission_log(file: Path, data: Path, windows: int, how: Manner) -> None:
-    """Commission the machine in ``file`` by a log; the results go to the standard output, or into ``file``."""
+def commission_log(file: Path, data: tuple[Path, ...], windows: int, how: Manner) -> None:
+    """Commission the machine in ``file`` by logs; the results go to the standard output, or into ``file``."""
     from otolith.cli.commissioning.noise import HealthyLog
 
     machine, store = loaded(file)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
+from otolith.cli.common import AS_JSON, DATA_FILES, MACHINE_FILE, echo_warnings, progress_line
 from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
@@ -24,19 +24,20 @@ if TYPE_CHECKING:
 
 @click.command()
 @MACHINE_FILE
-@DATA_FILE
+@DATA_FILES
 @click.option("--windows", type=click.IntRange(1, 1000), default=30, help="Use at most so many, spread over the data.")
 @AS_JSON
-def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
+def noise(file: Path, data: tuple[Path, ...], windows: int, as_json: bool) -> None:
     """Identify noise and delays of the machine in FILE from DATA.
 
-    DATA is recorded from the healthy machine in motion, in a format of 'otolith replay'. The output replaces the
+    DATA is recorded from the healthy machine in motion, in formats of 'otolith replay': one file, or several of which
+    each is a recording of its own. The output replaces the
     tables [noise] and [process_noise] of FILE. Delays of signals against each other belong into [signals].
 
     \b
     Examples:
       otolith noise my-machine.toml monday.csv
-      otolith noise my-machine.toml monday.csv --windows 100 --json
+      otolith noise my-machine.toml monday.csv tuesday.csv --windows 100 --json
     """
     from otolith.machine import load_machine
 
@@ -66,15 +67,20 @@ class HealthyData(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HealthyLog:
-    """A log."""
+    """A log, or several, of which each is a recording of its own."""
 
-    path: Path
+    files: tuple[Path, ...]
+
+    @property
+    def path(self) -> Path:
+        """The names of the files."""
+        return self.files[0].with_name(", ".join(file.name for file in self.files))
 
     def opened(self, machine: "LoadedMachine") -> "Reader":
         """See :class:`HealthyData`."""
-        from otolith.runtime.replay import open_recorded
+        from otolith.runtime.replay import open_recordings
 
-        return open_recorded(machine, self.path)
+        return open_recordings(machine, self.files)
 
 
 @dataclass(frozen=True, slots=True)

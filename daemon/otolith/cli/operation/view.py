@@ -37,13 +37,13 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 
 
 @click.command()
-@click.argument("recording", metavar="[MACHINE|FILE]", required=False)
+@click.argument("recordings", metavar="[MACHINE|FILE]...", nargs=-1)
 @click.option("--since", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
               help="All recordings from here on, like 12h, 30d, 8w.")  # fmt: skip
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
 @click.option("--live", is_flag=True, help="Show what is added to it as well.")
 @click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
-def view(recording: str | None, since: Since | None, only_list: bool, live: bool, web: bool) -> int:
+def view(recordings: tuple[str, ...], since: Since | None, only_list: bool, live: bool, web: bool) -> int:
     """Open the newest recording, or FILE, in the Rerun viewer.
 
     MACHINE is the name of the machine that it is of, with or without its site, its machine file, or an instance of the
@@ -58,6 +58,11 @@ def view(recording: str | None, since: Since | None, only_list: bool, live: bool
     """
     if live and (since or only_list):
         raise click.UsageError("--live follows the newest recording: give it without --since and --list")
+    if len(recordings) > 1:
+        if live or since or only_list or not all(name.endswith(".rrd") for name in recordings):
+            raise click.UsageError("several are opened only if all are files (.rrd), without other choices")
+        return open_viewer([Path(name) for name in recordings], web=web)
+    recording = recordings[0] if recordings else None
     path = Path(recording) if recording and is_file(recording) and not recording.endswith(".toml") else None
     path = Path(recording) if recording and recording.endswith(".rrd") else path
     if path is not None:

@@ -150,7 +150,7 @@ def _finish(
         decide = (
             ask_if_healthy if questions.asks else lambda: None
         )  # what nobody was asked is no part of a healthy machine
-        commission_log(file, Path(source.check), WINDOWS, Manner(decide, write=True))
+        commission_log(file, (Path(source.check),), WINDOWS, Manner(decide, write=True))
     else:
         echo(*lines_without_limits(load_machine(file, with_driver=False)))
     echo(*next_lines(file, source, is_commissioned=commissions))
