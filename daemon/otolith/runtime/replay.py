@@ -92,7 +92,7 @@ def _open_as(machine: LoadedMachine, data: Path, config: DriverConfig) -> Reader
             return format_of(data).open_log(data, config.setup, config.options)
     if has_frames and kind != "replay":
         raise ConfigurationError(f"{data}: a log of a CAN bus, but source {config.name!r} has type = {kind!r}")
-    if kind != "replay" or (not has_frames and format_of(data) is not format_of(config.options.file)):
+    if kind != "replay" or (not has_frames and format_of(data).Source is not format_of(config.options.file).Source):
         return open_by_name(machine, data, config.signals)
     from otolith_drivers.replay.driver import opener  # noqa: PLC0415 - only for a machine file that names it
 

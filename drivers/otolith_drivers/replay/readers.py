@@ -43,6 +43,8 @@ CAN_LOG = "otolith_drivers.replay.can_log"
 READERS = dict.fromkeys((".asc", ".blf", ".db", ".log", ".mf4", ".trc"), CAN_LOG)
 RECORDING, RECORDING_HEAD = ".rrd", b"RRF"
 READERS[RECORDING] = "otolith_drivers.replay.recording"
+ARRAYS = "otolith_drivers.replay.exports.arrays"  # files that begin so
+ARRAY_HEADS = (b"PAR1", b"ARROW1", b"\x89HDF", b"MATLAB 5.0", b"MATLAB 7.3", b"TDSm")
 TABLE = "otolith_drivers.replay.table.reader"  # all other files
 
 # Formats by the first bytes: text logs of a CAN bus, and what a refusal names.
@@ -260,8 +262,10 @@ def holds_frames(path: Path) -> bool:
 
 def _module_of(path: Path) -> str:
     """The module that reads ``path``: by its suffix, and for a text by its first line."""
-    module = READERS.get(suffix_of(path))
-    return module or (CAN_LOG if text_log(head_of(path)) else TABLE)
+    if (module := READERS.get(suffix_of(path))) is not None:
+        return module
+    head = head_of(path)
+    return CAN_LOG if text_log(head) else ARRAYS if head.startswith(ARRAY_HEADS) else TABLE
 
 
 def format_of(path: Path) -> Format:

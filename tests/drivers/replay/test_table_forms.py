@@ -145,6 +145,11 @@ def test_a_value_per_row_in_columns_of_any_name(tmp_path: Path) -> None:
         samples(path, {**options, "names": "what"}, x={"column": "a"})
 
 
+def test_the_columns_of_a_data_log_may_be_separated_by_bars(tmp_path: Path) -> None:
+    path = written(tmp_path, "time|path|value", "0|GVL.n|1.5", "1|GVL.u|24", "2|GVL.n|2.5")
+    assert samples(path, n={"column": "GVL.n"})["n"] == [(0.0, 1.5), (2.0, 2.5)]
+
+
 def test_blocks_of_variables_one_below_the_other_are_merged_by_time(tmp_path: Path) -> None:
     rows = [f"{row},a,{row}" for row in range(20)] + [f"{row},b,{2 * row}" for row in range(20)]
     path = written(tmp_path, "t,tag,value", *rows)

@@ -1,0 +1,267 @@
+"""A file of arrays (Parquet, Feather, HDF5, MATLAB, TDMS) as rows of numbers.
+
+The names of its columns are the header of a table, so the times are found, and asked about, as in a text.
+"""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from datetime import UTC, tzinfo
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from otolith_drivers import keep_pandas_out
+from otolith_drivers.base import Setup
+from otolith_drivers.common.time_zones import zone_named
+from otolith_drivers.config_files import Range
+from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
+from otolith_drivers.replay.exports.stores import STORES, ArrayTable, Moments
+from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, MergedReader, Reader, Rows, head_of
+from otolith_drivers.replay.table.cells import numbers
+from otolith_drivers.replay.table.header import TIME, Column, ColumnRequest, read_header
+from otolith_drivers.replay.table.options import TableOptions, TableSource
+from otolith_drivers.replay.table.times import Clock, TimeRequest, on_wall_clock, question_of_unit
+
+ROWS = 50_000  # read at once; engineering choice: as a chunk of a text table
+
+keep_pandas_out()
+
+Source, Options = TableSource, TableOptions  # for readers.Format
+
+
+def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> Reader:
+    """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
+    if options is not None and options.names is not None:
+        raise ConfigurationError(f"{path}: 'names' and 'values' are for text tables: this file has a column each")
+    DataFile(path).close()  # raises if it cannot be read
+    signals = {signal.name: signal for signal in setup.signals}
+    sources = {name: signal.source for name, signal in signals.items()}
+    if options is not None and options.time is not None:
+        time = options.time
+        sources = {name: source if source.time else source.model_copy(update={"time": time})
+                   for name, source in sources.items()}  # fmt: skip
+    with ExitStack() as opened:
+        tables = tables_of(path, opened)
+    by_clock: dict[str, list[str]] = {}
+    for name, source in sources.items():
+        table, column = found(path, tables, source.column or name)
+        clock = f"{table.name} {table.length} {source.time} {table.times.get(column)}"
+        by_clock.setdefault(clock, []).append(name)
+
+    def open_columns(names: Sequence[str]) -> ArrayReader:
+        units = {name: (signals[name].unit, signals[name].ordinary) for name in names}
+        return ArrayReader(path, units, {name: sources[name] for name in names}, zone_named(setup.timezone))
+
+    if len(by_clock) < 2:
+        return open_columns(list(signals))
+    return MergedReader(path, by_clock, lambda clock: open_columns(by_clock[clock]), is_one_file=True)
+
+
+def tables_of(path: Path, opened: ExitStack) -> list[ArrayTable]:
+    """The tables of a file; raise ConfigurationError if it is damaged, or has none."""
+    head = head_of(path)
+    name, tables = next((store for start, store in STORES.items() if head.startswith(start)), ("", None))
+    if tables is None:
+        raise ConfigurationError(f"{path}: is not what its name says: unpack it if it is compressed")
+    try:
+        read = tables(path, opened)
+    except ConfigurationError:
+        raise
+    except Exception as error:  # the libraries raise anything on damaged data
+        raise ConfigurationError(f"{path}: {name} that is damaged: {_cause(error)}") from error
+    if not read:
+        raise ConfigurationError(f"{path}: {name} without columns of numbers")
+    return read
+
+
+def found(path: Path, tables: Sequence[ArrayTable], written: str) -> tuple[ArrayTable, str]:
+    """The table with a column of a name, in front of which may be the one of its group, and its own name."""
+    places = [
+        (table, own)
+        for table in tables
+        for own in table.columns
+        if written in (own, f"{table.name}/{own}", f"{table.name}.{own}")
+    ]
+    if len(places) > 1:
+        several = ", ".join(f"{table.name}/{own}" for table, own in places)
+        raise ConfigurationError(f"{path}: several columns are {written!r}: write the one that is meant: {several}")
+    if not places:
+        known = [own for table in tables for own in table.columns]
+        raise ConfigurationError(f"{path}: no column {written!r}: {nearest(written, known)}")
+    return places[0]
+
+
+class ArrayReader(Reader):
+    """Columns of one table of the file."""
+
+    place = "row"
+    is_table = True
+
+    def __init__(
+        self,
+        path: Path,
+        units: Mapping[str, tuple[str, Range | None]],
+        sources: Mapping[str, TableSource],
+        zone: tzinfo = UTC,
+    ) -> None:
+        """``units`` has the unit of each signal, and the range of an input in ordinary operation."""
+        super().__init__(path)
+        self._zone, self._opened = zone, ExitStack()
+        try:
+            self._open(units, sources)
+        except BaseException:
+            self._opened.close()
+            raise
+        self._times = EvenTimes()
+        self._read = self._rows = self._bad = self._blank = 0
+
+    def _open(self, units: Mapping[str, tuple[str, Range | None]], sources: Mapping[str, TableSource]) -> None:
+        tables = tables_of(self.path, self._opened)
+        places = {name: found(self.path, tables, source.column or name) for name, source in sources.items()}
+        self._table = next(iter(places.values()))[0]
+        self._columns = {name: column for name, (_, column) in places.items()}
+        self._sources = sources
+        stated = next(iter(sources.values())).time
+        request = None if stated is None else stated.request
+        self._even = None if stated is not None else self._table.times.get(next(iter(self._columns.values())))
+        names = list(self._table.columns)
+        wanted = {
+            name: ColumnRequest(self._columns[name], units[name][0], source.unit, *source.scaling)
+            for name, source in sources.items()
+        }
+        text = self._text(names)
+        if self._even is not None:  # its times are in no column
+            names, request = [TIME, *(name for name in names if name != TIME)], TimeRequest(TIME, "s", is_known=True)
+            text = "sep=\t\n" + "\t".join([TIME, *map(self._cell, names[1:])]) + "\n"
+        self._header = read_header(self.path, io.StringIO(text), wanted, request)
+        self._names = names
+        self._clock = Clock(request or TimeRequest(), self._header.columns[TIME].scale, self._zone)
+        self.ignored = tuple(name for name, _, _ in self._header.others)
+        self._no_readings = {}
+        for name, source in sources.items():
+            limits = units[name][1]
+            limits = limits and self._header.columns[name].written(limits)
+            self._no_readings[name] = NoReadings(source.range, limits)
+
+    def _text(self, names: Sequence[str]) -> str:
+        """The header of the table as a text, with its first rows, of which the times are judged."""
+        lines = ["sep=\t", "\t".join(map(self._cell, names))]
+        if self._even is None:
+            part = next(self._table.parts(names, 5), {})
+            columns = [[str(value) for value in part[name].tolist()] for name in names] if part else []
+            lines += ["\t".join(row) for row in zip(*columns, strict=True)]
+        return "\n".join(lines) + "\n"
+
+    def _cell(self, name: str) -> str:
+        unit = self._table.columns[name]
+        return f"{name} [{unit}]".replace("\t", " ") if unit else name.replace("\t", " ")
+
+    def __exit__(self, *error: object) -> None:
+        self._opened.close()
+
+    @property
+    def progress(self) -> float:
+        """Share of the rows that were read, 0 to 1."""
+        return self._read / max(self._table.length, 1)
+
+    @property
+    def bad(self) -> int:
+        """Number of rows without a time."""
+        return self._bad
+
+    def chunks(self) -> Iterator[Rows]:
+        columns = {name: self._names[column.place] for name, column in self._header.columns.items()}
+        read = list(dict.fromkeys(name for key, name in columns.items() if key != TIME or self._even is None))
+        for part in self._parts(read):
+            count = len(part[read[0]])
+            rows = self._rows_of(part, columns, count)
+            self._read += count
+            if len(rows.times):
+                if not self._header.is_unit_stated and (question := question_of_unit(rows.times)):
+                    raise ConfigurationError(f"{self.path}: {question}")
+                self._rows += len(rows.times)
+                yield from self._times.of(rows)
+        yield from self._times.rest()
+        if not self._rows:
+            raise ConfigurationError(f"{self.path}: none of its {self._read} rows has a time")
+
+    def _parts(self, names: Sequence[str]) -> Iterator[Mapping[str, NDArray[Any]]]:
+        parts = self._table.parts(names, ROWS)
+        while True:
+            try:
+                part = next(parts, None)
+            except Exception as error:  # the libraries raise anything on damaged data
+                raise ConfigurationError(f"{self.path}: damaged behind row {self._read}: {_cause(error)}") from error
+            if part is None:
+                return
+            yield part
+
+    def _rows_of(self, part: Mapping[str, NDArray[Any]], columns: Mapping[str, str], count: int) -> Rows:
+        lines = np.arange(self._read, self._read + count) + 1
+        if self._even is not None:
+            times: Array = np.asarray(self._even[0] + self._even[1] * (lines - 1.0))
+        else:
+            times = self._seconds(part[columns[TIME]], self._header.columns[TIME])
+        timed = np.abs(times) <= MAX_TIME
+        bad = self._bad + np.cumsum(~timed)
+        self._bad = int(bad[-1]) if count else self._bad
+        values = {}
+        for name, source in self._sources.items():
+            written = _floats(part[columns[name]])[timed]
+            written[np.isinf(written)] = np.nan
+            self._blank += int(np.count_nonzero(np.isnan(written)))
+            values[name] = self._header.columns[name].scaled(written)
+            asked = written if source.range is None else source.value(written)
+            values[name][self._no_readings[name].among(asked)] = np.nan
+        return Rows(times[timed], values, lines[timed], bad[timed])
+
+    def _seconds(self, cells: NDArray[Any], column: Column) -> Array:
+        if cells.dtype.kind == "M":
+            known = ~np.isnat(np.asarray(cells))
+            times: Array = np.full(len(cells), np.nan)
+            times[known] = np.asarray(cells)[known].astype("datetime64[us]").astype(np.float64) * 1e-6
+            if not (isinstance(cells, Moments) and cells.has_zone):
+                times[known] = on_wall_clock(times[known], self._zone)
+            return times
+        if cells.dtype == object:
+            texts = pa.array([str(cell) for cell in cells], pa.string())
+            return self._clock.times(column.scaled(numbers(texts, ".")), texts)
+        written = _floats(cells)
+        return self._clock.times(column.scaled(written), pa.array([""] * len(written)))
+
+    def describe(self) -> list[str]:
+        group = f" of {self._table.name!r}" if self._table.name else ""
+        return [
+            f"{name} [{self._header_unit(name)}] from column {column!r}{group}"
+            for name, column in self._columns.items()
+        ]
+
+    def _header_unit(self, name: str) -> str:
+        return self._sources[name].unit or self._table.columns[self._columns[name]] or "unit of the twin"
+
+    def summary_lines(self) -> list[str]:
+        rows = [f"{counted(self._rows, 'row')} read", counted(self._bad, "bad row")]
+        return [*rows, f"{counted(self._blank, 'cell')} blank"]
+
+    def warnings(self) -> list[str]:
+        lines = [] if (coarse := self._times.text()) is None else [coarse]
+        if self._bad:
+            lines.append(f"bad rows: {self._bad} have no time")
+        for name, no_readings in self._no_readings.items():
+            lines += no_readings.warnings(name)
+        return lines
+
+
+def _floats(cells: NDArray[Any]) -> Array:
+    if cells.dtype == object:
+        return numbers(pa.array([str(cell) for cell in cells], pa.string()), ".")
+    return np.asarray(cells).astype(np.float64)
+
+
+def _cause(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
