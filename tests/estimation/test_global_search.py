@@ -1,5 +1,7 @@
 """The global search: the contract of pymoo's algorithms, and the global optimum from cold starts."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
@@ -173,3 +175,25 @@ def test_an_outcome_of_an_earlier_version_is_understood() -> None:
     assert Outcome("particle swarm and Gauss-Newton reached the same point") is Outcome.AGREED
     with pytest.raises(ValueError, match="no such"):
         Outcome("no such outcome")
+
+
+FOUND = """
+import sys
+from tests.estimation.test_global_search import Valleys, minimum_of
+if sys.argv[1] == "scipy":
+    from scipy.spatial.distance import cdist
+    from otolith.estimation import minimisers
+    minimisers._distances = cdist
+print(*(minimum_of(Valleys(), name, seed, 60).position.tobytes().hex() for name in ("pso", "de") for seed in (1, 2)))
+print(*(name for name in ("scipy.spatial", "scipy.sparse", "scipy.special") if name in sys.modules))
+"""
+
+
+def test_a_population_loads_no_tree_of_neighbours_and_moves_as_with_one() -> None:
+    """Pymoo leaves out repeated positions by SciPy's distances, whose package takes 7 MB of each worker."""
+    own, of_scipy = (
+        subprocess.run([sys.executable, "-c", FOUND, name], capture_output=True, text=True, check=True).stdout
+        for name in ("own", "scipy")
+    )
+    positions, loaded = own.split("\n")[:2]
+    assert (positions, loaded) == (of_scipy.split("\n")[0], "")

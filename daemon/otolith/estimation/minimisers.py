@@ -164,6 +164,11 @@ def minimise(cost: Cost, first: Array, options: SwarmOptions, random: np.random.
     return PopulationMinimum(recorded.position, recorded.best, generations, recorded.evaluations)
 
 
+def _distances(first: Array, second: Array) -> Array:
+    """Return the distance of each of the ``first`` positions from each of the ``second`` ones."""
+    return np.asarray(np.linalg.norm(first[:, None] - second[None], axis=-1))
+
+
 def _set_up(cost: Cost, first: Array, options: SwarmOptions, random: np.random.Generator) -> Any:
     """Return the algorithm of ``options``, which begins with the ``first`` positions.
 
@@ -171,9 +176,11 @@ def _set_up(cost: Cost, first: Array, options: SwarmOptions, random: np.random.G
     5 MB; that of CMA-ES, which loads Matplotlib, 3 s and 94 MB.
     """
     from pymoo.config import Config  # noqa: PLC0415
+    from pymoo.core import duplicate  # noqa: PLC0415
     from pymoo.core.problem import Problem as PymooProblem  # noqa: PLC0415
     from pymoo.core.termination import NoTermination  # noqa: PLC0415
 
+    duplicate.cdist = _distances  # SciPy's needs packages that nothing else of a worker uses
     Config.warnings["not_compiled"] = False  # it would be printed, and nothing here is slower without
     used = first.shape[1]
     if used < MIN_DIMENSIONS:
