@@ -9,7 +9,7 @@ from benchmarks.changes.machines import ONE_MASS, twin_of
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
+from otolith.adaptation.state import Ledger, OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation import imm_filter
 from otolith.estimation.imm_filter import ParameterCusum, shift_limit
@@ -113,9 +113,9 @@ def test_sums_of_healthy_windows_alarm_as_often_as_stated(
 
 def test_a_reset_of_one_parameter_forgets_no_other() -> None:
     sums = ParameterCusum(np.array([[3.0, 12.0], [0.0, 0.0]]))
-    state = replace(initial_state("shaft", "bench", PROBLEM), cusum=sums)
-    assert state.cusum.moved == [0, 1]
-    assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).cusum.moved == []
+    state = replace(initial_state("shaft", "bench", PROBLEM), ledger=Ledger(sums))
+    assert state.ledger.cusum.moved == [0, 1]
+    assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).ledger.cusum.moved == []
 
 
 def test_the_lag_behind_a_drift_is_no_shift() -> None:

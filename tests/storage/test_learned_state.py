@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from otolith.adaptation.state import (
     EVERYTHING,
     AdaptationState,
+    Ledger,
     OperatorDecisions,
     apply_decisions,
     component_records,
@@ -150,10 +151,10 @@ def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
 def test_what_shifted_the_last_windows_survives_a_restart(tmp_path: Path) -> None:
     state = healthy()
     sums = np.tile([[3.0], [0.5]], len(state.problem.free))
-    shifted = replace(state, cusum=ParameterCusum(sums))
-    assert restarted(shifted, tmp_path).cusum.sums == pytest.approx(sums)
+    shifted = replace(state, ledger=Ledger(ParameterCusum(sums)))
+    assert restarted(shifted, tmp_path).ledger.cusum.sums == pytest.approx(sums)
     with pytest.raises(OtolithError, match="shifts: not plausible"):
-        store_in(tmp_path).save(replace(state, cusum=ParameterCusum(-sums)))
+        store_in(tmp_path).save(replace(state, ledger=Ledger(ParameterCusum(-sums))))
 
 
 def test_histories_survive_a_restart_and_forecasts_are_computed_again(tmp_path: Path) -> None:

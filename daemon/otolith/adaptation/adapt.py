@@ -1,9 +1,9 @@
 """``adapt(state, window) -> (state, report)``: the one entry to the core, a pure function.
 
-    predict → check data → fit → test against the prediction, screen → (search → compare hypotheses) → update → report
+    predict → check → fit → score → decide → update → sum up → report
 
 Time arrives with the window and randomness with the seed. Every run is therefore reproducible bit for bit, and the work
-can move between processes.
+can move between processes. ``docs/explanation/evidence.md`` has the quantities that are compared.
 """
 
 from dataclasses import dataclass, replace
@@ -15,12 +15,12 @@ from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
+    Ledger,
     with_converter_steps,
     with_posterior,
     with_records,
 )
-from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO, InputNoiseSums
-from otolith.commissioning.structure import PooledWindows
+from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO
 from otolith.discovery.alternatives import DATA_FAULTS, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import (
     MAX_COST,
@@ -58,24 +58,38 @@ UNUSED = "nothing is estimated from this window: "
 
 
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
-    """Return the state after ``window``, and the report of it."""
-    whole, (window, shortened) = window, last_records(window)
-    posterior = state.posterior.without_expired(window.start)
-    if posterior is not state.posterior:
-        state = with_posterior(state, posterior)
-    commands = posterior.problem.changing
-    bridged = with_changes_between(window, commands) if commands else window
-    state, predicted, checked = _predict_and_check(state, bridged)
-    result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
-    result = replace(result, notes=(*shortened, *checked.notes, *(own.text for own in result.faulty_sensors)))
+    """Return the state after ``window``, and the report of it.
+
+    - **Predict** what the filter knows at the end of the window, and **check** the data against it.
+    - **Fit** the parameters under the prediction. The window is expected if their innovation is.
+    - **Score** alternatives: does the window show a component, or windows together a moved parameter? If one shows, or
+      the window is not expected, all types of hypotheses are fitted and compared, in further windows as well.
+    - **Decide** what has happened, and **update** the posterior: by the filter, by the hypothesis that is accepted, or
+      not at all while it is open.
+    - **Sum up** what windows show only together: a weak component, the noise of an input.
+    - **Report** estimates, findings and events.
+    """
+    used, shortened = last_records(window)
+    state, predicted, checked = _predict_and_check(state, used)
+    tested, checked = _fit(state, predicted, checked)
+    if tested is None:
+        result, ledger = _reject(state, predicted, checked), state.ledger
+    else:
+        scores = _score(state, tested)
+        result = _decide_and_update(scores.state, tested, scores)
+        result, ledger = _search_together(scores.state, tested, result, scores.ledger)
+        result, ledger = _find_input_noise(scores.state, tested, result, ledger)
+    faulty = checked.faulty_sensors
+    result = replace(result, faulty_sensors=faulty, notes=(*shortened, *checked.notes, *(own.text for own in faulty)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
-    previous, report = make_report(state, window, result)
+    previous, report = make_report(state, used, result)
     document = report.document
     if shortened:  # reports come as often as whole windows
-        document = document.model_copy(update={"window": window_document(whole)})
+        document = document.model_copy(update={"window": window_document(window)})
     health, document = assess(state.plan, state.health, document)
-    return _next_state(state, result, previous, health), replace(report, document=document)
+    ledger = ledger.kept_after(result.decision, state.ledger)
+    return _next_state(state, result, ledger, previous, health), replace(report, document=document)
 
 
 def _predict_and_check(state: AdaptationState, window: Window) -> tuple[AdaptationState, Posterior, CheckedWindow]:
@@ -83,7 +97,10 @@ def _predict_and_check(state: AdaptationState, window: Window) -> tuple[Adaptati
 
     If the data are faulty, the state keeps its steps: differences between faulty values are none of a converter.
     """
-    problem, predicted = state.posterior.problem, state.posterior.with_steps(window).predict(window)
+    state = with_posterior(state, state.posterior.without_expired(window.start))
+    if commands := state.problem.changing:
+        window = with_changes_between(window, commands)
+    problem, predicted = state.problem, state.posterior.with_steps(window).predict(window)
     checked = check_window(window, predicted)
     if predicted.problem is problem:
         return state, predicted, checked
@@ -112,32 +129,55 @@ class _TestedEstimate:
         return self.estimated.is_explained and self.innovation.is_expected
 
 
-def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
-    """Return the result of a window whose data are usable, unless a gap leaves nothing to determine.
+def _fit(
+    state: AdaptationState, predicted: Posterior, checked: CheckedWindow
+) -> tuple[_TestedEstimate | None, CheckedWindow]:
+    """Return the estimate of a window and what was checked; None if its data are faulty, or a gap leaves nothing.
 
     If the window is not expected because a sensor is saturated, the other samples are estimated from.
     """
+    if not checked.is_usable:
+        return None, checked
     search = SwarmSearch.NEVER if some_parameter_is_determined(state.previous) else SwarmSearch.FROM_BOUNDS
-    tested = _TestedEstimate.of(predicted, checked.window, search)
-    saturated: tuple[FaultySensor, ...] = ()
+    tested, saturated = _TestedEstimate.of(predicted, checked.window, search), tuple[FaultySensor, ...]()
     if not tested.is_expected and (rest := without_saturated(predicted, checked.window)) is not None:
         window, sensor = rest
         tested, saturated = _TestedEstimate.of(predicted, window, search), (sensor,)
-    gap = unbridged_gap(tested.estimated) if checked.window.bridge_error is not None else ""
-    if gap:
-        return _reject(state, predicted, replace(checked, bad=(gap,)))
-    return replace(_decide(state, tested), faulty_sensors=saturated)
+    if checked.window.bridge_error is not None and (gap := unbridged_gap(tested.estimated)):
+        return None, replace(checked, bad=(gap,))
+    return tested, replace(checked, faulty_sensors=saturated)
 
 
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
     """Return the result of a window whose data are faulty: it does not update the posterior."""
     decision = WindowDecision.BAD if checked.bad else WindowDecision.SENSOR
     reason = UNUSED + "; ".join(checked.bad or (sensor.text for sensor in checked.faulty_sensors))
-    result = WindowResult.unchanged(state, predicted, decision, reason=reason)
-    return replace(result, faulty_sensors=checked.faulty_sensors)
+    return WindowResult.unchanged(state, predicted, decision, reason=reason)
 
 
-def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scores:
+    """What speaks for alternatives to the prediction after a window."""
+
+    state: AdaptationState  # Before the window, without a test that has ended
+    ledger: Ledger  # With the shifts of the parameters in this window
+    is_calm: bool  # Whether the window is expected, and shows nothing that the twin lacks
+    test: SequentialTest | None  # Of the hypotheses, after this window; None if none is open
+    is_new: bool  # Whether this window opened the test
+
+
+def _score(state: AdaptationState, tested: _TestedEstimate) -> _Scores:
+    """Screen the window, add the shifts of its parameters, and compare the hypotheses if it gives reason to."""
+    screening, cusum = _screen(state, tested), _parameter_cusum(state, tested)
+    is_calm = tested.is_expected and not screening.is_positive
+    test = _continued_test(state, tested, screening)
+    is_new = test is None and not is_calm
+    if is_new:
+        state, test = replace(state, test=None), open_test(tested.predicted, screening)
+    return _Scores(state, replace(state.ledger, cusum=cusum), is_calm, test, is_new)
+
+
+def _decide_and_update(state: AdaptationState, tested: _TestedEstimate, scores: _Scores) -> WindowResult:
     """Return the result of a window whose data are usable. The first of these cases that applies decides.
 
     - No test is open, and the window shows nothing that the twin lacks: the filter is updated. Parameters that this
@@ -146,22 +186,16 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     - The window shows nothing of what opened the test: the filter is updated beside it.
     - Otherwise the decision of the test is applied.
     """
-    screening, cusum = _screen(state, tested), _parameter_cusum(state, tested)
-    is_calm = tested.is_expected and not screening.is_positive
-    test = _continued_test(state, tested, screening)
-    is_new = test is None and not is_calm
-    if is_new:
-        state, test = replace(state, test=None), open_test(tested.predicted, screening)
+    test, moved = scores.test, scores.ledger.cusum.moved
     if test is None:
-        result = _reset_moved(state, tested, cusum.moved) if cusum.moved else _update_filter(state, tested)
-    elif is_new and tested.is_expected and test.is_null_possible:
+        return _reset_moved(state, tested, moved) if moved else _update_filter(state, tested)
+    if scores.is_new and tested.is_expected and test.is_null_possible:
         result = _update_filter(state, tested)
-    elif not is_new and is_calm and not cusum.moved and not test.filter_evidence.is_against:
+    elif not scores.is_new and scores.is_calm and not moved and not test.filter_evidence.is_against:
         result = _update_filter_beside(state, tested, test)
     else:
-        result = _apply_decision(state, tested, test, is_new=is_new)
-    result = _with_pooled(state, tested, replace(result, searched=test is not None, cusum=cusum))
-    return _with_input_noise(state, tested, result)
+        result = _apply_decision(state, tested, test, is_new=scores.is_new)
+    return replace(result, searched=True)
 
 
 def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
@@ -195,11 +229,11 @@ def _parameter_cusum(state: AdaptationState, tested: _TestedEstimate) -> Paramet
     """Return the sums after a window; estimates without trends are biased where a parameter drifts fast."""
     estimated = tested.estimated
     if estimated.drifts:
-        return state.cusum
+        return state.ledger.cusum
     values = np.array([own.value for own in estimated.parameters])
     sd = np.array([own.sd for own in estimated.parameters])
     length = estimated.fit.window.grid.length
-    return state.cusum.after(tested.predicted.shifts(values, sd, estimated.trend_response, length))
+    return state.ledger.cusum.after(tested.predicted.shifts(values, sd, estimated.trend_response, length))
 
 
 def _apply_decision(
@@ -248,23 +282,27 @@ def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowRes
     return _without_faded(state, result, estimated) if state.adopted else result
 
 
-def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
-    """Return the result of a window; if the twin explains it, it is searched together with those before."""
+def _search_together(
+    state: AdaptationState, tested: _TestedEstimate, result: WindowResult, ledger: Ledger
+) -> tuple[WindowResult, Ledger]:
+    """Return result and ledger of a window; if the twin explains it, it is searched together with those before."""
     fitted = tested.estimated.fit
     is_undecided = result.decision is not WindowDecision.LEARNED or result.test is not None
     if is_undecided or not fitted.is_explained or tested.estimated.drifts:
-        return result
-    pooled = state.pooled.after(fitted, result.after.mean[: len(fitted.problem.free)])
-    if pooled.confirmed is None:
-        return replace(result, pooled=pooled)
-    record = ComponentRecord.of(pooled.confirmed)
+        return result, ledger
+    ledger = replace(ledger, pooled=ledger.pooled.after(fitted, result.after.mean[: len(fitted.problem.free)]))
+    if ledger.pooled.confirmed is None:
+        return result, ledger
+    record = ComponentRecord.of(ledger.pooled.confirmed)
     again = _TestedEstimate.of(with_records(tested.predicted, (record,), forget_phases=False), fitted.window)
     discovered = _update_filter(replace(state, adopted=(*state.adopted, record.adopted)), again)
-    return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
+    return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after), ledger
 
 
-def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
-    """Return the result of a window; if windows together show the noise of an input, it is estimated with that noise.
+def _find_input_noise(
+    state: AdaptationState, tested: _TestedEstimate, result: WindowResult, ledger: Ledger
+) -> tuple[WindowResult, Ledger]:
+    """Return result and ledger; if windows together show the noise of an input, the window is estimated with it.
 
     A test that is open then ends. While a late signal leads it, or a sensor is faulty, its windows are not summed: such
     errors correlate with fast changes as noise does.
@@ -274,23 +312,23 @@ def _with_input_noise(state: AdaptationState, tested: _TestedEstimate, result: W
     is_due = result.searched or has_disagreed or fitted.window.index % SUMMED_EVERY == 0
     is_late = result.test is not None and result.test.best.type is FaultType.TIMING
     if is_late or result.decision in DATA_FAULTS or not is_due:
-        return result
-    sums = state.input_noise.after(fitted)
-    result = replace(result, input_noise=sums)
-    levels = None if result.update is PosteriorUpdate.HYPOTHESIS else sums.levels(fitted)
+        return result, ledger
+    ledger = replace(ledger, input_noise=ledger.input_noise.after(fitted))
+    levels = None if result.update is PosteriorUpdate.HYPOTHESIS else ledger.input_noise.levels(fitted)
     if levels is None:
-        return result
+        return result, ledger
     problem = fitted.problem.with_levels(levels)
     stated, noisier = (replace(fitted, problem=own).linearised_at_end() for own in (fitted.problem, problem))
     inflation = prior_inflation(stated, noisier)
     again = _TestedEstimate.of(tested.predicted.with_noise(problem, inflation), fitted.window)
     accepted = _update_filter(replace(state, test=None), again)
     if not again.is_expected or accepted.decision is not WindowDecision.LEARNED:
-        return result
+        return result, ledger
     if result.is_mixture:  # what the hypotheses differ in stays uncertain: one of them may hold beside the noise
         posterior = accepted.posterior.set_prior(result.after).with_noise(problem, inflation)
         accepted = replace(accepted, posterior=posterior, after=posterior.prior())
-    return replace(accepted, decision=WindowDecision.NOISIER, before=accepted.after, searched=result.searched)
+    accepted = replace(accepted, decision=WindowDecision.NOISIER, before=accepted.after, searched=result.searched)
+    return accepted, ledger
 
 
 def _reset_moved(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
@@ -350,20 +388,14 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
 
 
 def _next_state(
-    state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus], health: HealthState
+    state: AdaptationState,
+    result: WindowResult,
+    ledger: Ledger,
+    previous: dict[str, PreviousStatus],
+    health: HealthState,
 ) -> AdaptationState:
-    """Return the state for the next window.
-
-    A posterior that replaces the filter's contains what earlier windows have shown: their test, the cumulative sums of
-    parameters and the pool end. The sums of the noise of inputs end only with accepted noise.
-    """
-    test, cusum, pooled = result.test, result.cusum or state.cusum, result.pooled or state.pooled
-    input_noise = result.input_noise or state.input_noise
-    if result.update is PosteriorUpdate.HYPOTHESIS:
-        test, cusum, pooled = None, ParameterCusum(), PooledWindows()
-        input_noise = InputNoiseSums() if result.decision is WindowDecision.NOISIER else input_noise
-    elif result.decision in DATA_FAULTS:  # the error of a sensor shifts no parameter
-        cusum = state.cusum
+    """Return the state for the next window; a posterior that replaces the filter's ends the test."""
+    test = None if result.update is PosteriorUpdate.HYPOTHESIS else result.test
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
         test = state.test
     return replace(
@@ -373,9 +405,7 @@ def _next_state(
         learned=state.learned + result.is_accepted,
         contradictions=result.contradictions(state),
         adopted=result.adopted,
-        cusum=cusum,
-        pooled=pooled,
-        input_noise=input_noise,
+        ledger=ledger,
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,

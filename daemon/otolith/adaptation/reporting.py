@@ -8,8 +8,6 @@ import numpy as np
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
-from otolith.commissioning.input_noise import InputNoiseSums
-from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.alternatives import (
     ACCEPTED,
     ALTERNATIVES,
@@ -31,7 +29,6 @@ from otolith.discovery.experiment_design import Situation, advise, deciding_expe
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
-from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of, wrapped
@@ -99,9 +96,6 @@ class WindowResult:
     notes: tuple[str, ...] = ()  # What the data checks left out
     is_mixture: bool = False  # Whether after is the mixture of the hypotheses of an open test
     searched: bool = False  # Whether other hypotheses were compared
-    cusum: ParameterCusum | None = None  # After this window; None for a window that was not estimated from
-    pooled: PooledWindows | None = None  # With this window, if the twin explained it
-    input_noise: InputNoiseSums | None = None  # With this window, if it was added
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result

@@ -7,6 +7,7 @@ import numpy as np
 
 from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows, Structure
+from otolith.discovery.alternatives import DATA_FAULTS, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum
@@ -26,6 +27,28 @@ PHASE = 2  # position of the phase among the values of a component
 EVERYTHING = "*"  # Stands for all parameters, components and noise levels among the names of OperatorDecisions.resets
 
 
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """What windows show only together; beside it, posterior and test are what they have shown."""
+
+    cusum: ParameterCusum = field(default_factory=ParameterCusum)
+    """By how much the estimates of windows have differed from their predictions, all the same way."""
+    pooled: PooledWindows = field(default_factory=PooledWindows)
+    """The last windows that the twin explained, which are searched together."""
+    input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
+    """What windows show of the noise of inputs for which none is stated."""
+
+    def kept_after(self, decision: WindowDecision, before: "Ledger") -> "Ledger":
+        """Return what remains of the ledger after a window that led to ``decision``; ``before`` is without the window.
+
+        A posterior that replaces the filter's contains what earlier windows have shown. The sums of the noise of inputs
+        end only with accepted noise. The error of a sensor shifts no parameter.
+        """
+        if UPDATES[decision] is PosteriorUpdate.HYPOTHESIS:
+            return Ledger() if decision is WindowDecision.NOISIER else Ledger(input_noise=self.input_noise)
+        return replace(self, cusum=before.cusum) if decision in DATA_FAULTS else self
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptationState:
     """Everything that is carried from window to window."""
@@ -42,12 +65,7 @@ class AdaptationState:
     restricted: frozenset[str] = frozenset()  # Keys of components that the machine file excludes
     approved: frozenset[str] = frozenset()  # Keys of components that the operator approved
     adopted: tuple[AdoptedComponent, ...] = ()  # The components in the twin
-    cusum: ParameterCusum = field(default_factory=ParameterCusum)
-    """By how much the estimates of windows have differed from their predictions, all the same way."""
-    pooled: PooledWindows = field(default_factory=PooledWindows)
-    """The last windows that the twin explained, which are searched together."""
-    input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
-    """What windows show of the noise of inputs for which none is stated."""
+    ledger: Ledger = field(default_factory=Ledger)
     noisier_since: float | None = None
     """Service time in s from which on more noise than stated is accepted; None if none is."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
@@ -190,7 +208,7 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
                 posterior=state.posterior.reset_parameters([index]),
                 previous=previous,
                 test=None,
-                cusum=ParameterCusum(),
+                ledger=replace(state.ledger, cusum=ParameterCusum()),
                 health=state.health.without_history(name).without_events(
                     {f"{kind}/{name}" for kind in ("limit", "trend", "lost")}, f"the operator reset {name}"
                 ),

@@ -54,7 +54,7 @@ from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
 
-VERSION = 7  # of the bundles: raised when a state has other fields
+VERSION = 8  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend

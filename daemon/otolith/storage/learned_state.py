@@ -197,7 +197,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
 
 def _sums(state: AdaptationState, free: int) -> tuple[tuple[float, ...], ...]:
     """Return the cumulative shifts; those of other parameters than the present ones count no more."""
-    sums = state.cusum.sums
+    sums = state.ledger.cusum.sums
     return () if sums is None or sums.shape[1] != free else tuple(map(tuple, sums.tolist()))
 
 
@@ -234,7 +234,7 @@ def restored(document: LearnedState, state: AdaptationState) -> AdaptationState:
         state,
         **kept,
         posterior=posterior,
-        cusum=_shifts(record),
+        ledger=replace(state.ledger, cusum=_shifts(record)),
         previous=dict(zip(record.labels, record.previous, strict=True)),
         adopted=adopted,
         resets=document.resets,
