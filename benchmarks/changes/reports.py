@@ -7,6 +7,7 @@ reports bit for bit, other numbers only, or another statement.
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +32,8 @@ BEFORE, AFTER = 4, 6  # windows
 MEASURED_WINDOWS = 6
 MEASURED_NOISE = 1e-5  # m: about what the twin leaves
 MEASURED = "servo_axis, measured"
+LEAST = 1e-9  # a smaller number is none, for example the probability of an alternative
+NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
 CLOSE = 1e-6  # relative difference of numbers that count as equal
 
 
@@ -106,15 +109,17 @@ class Difference:
 
     largest: float
     """Relative difference of two numbers."""
+    place: str
+    """Of these numbers."""
     others: tuple[str, ...]
-    """Places of what is no number and differs."""
+    """Places of what is no number and differs; numbers in texts do not count, which are rounded."""
 
     @property
     def text(self) -> str:
         """What differs, in words."""
         if self.others:
             return f"differs at {'; '.join(self.others[:3])}"
-        return f"numbers differ by up to {self.largest:.1e}" if self.largest else "the same"
+        return f"numbers differ by up to {self.largest:.1e}: {self.place}" if self.place else "the same"
 
     @property
     def is_close(self) -> bool:
@@ -124,13 +129,20 @@ class Difference:
 
 def compare(now: Any, before: Any) -> Difference:
     """Compare the reports of a run with those before."""
-    numbers, others = [0.0], []
+    largest, others = (0.0, ""), []
     for place, own, other in _pairs(now, before, ""):
-        if isinstance(own, float) and isinstance(other, float):
-            numbers.append(abs(own - other) / max(abs(own), abs(other), np.finfo(float).tiny))
-        elif own != other:
+        if own == other:
+            continue
+        are_numbers = isinstance(own, float) and isinstance(other, float)
+        if not are_numbers and _without_numbers(own) != _without_numbers(other):
             others.append(f"{place}: {str(other)[:60]} -> {str(own)[:60]}")
-    return Difference(max(numbers), tuple(others))
+        difference = abs(own - other) / max(abs(own), abs(other), LEAST) if are_numbers else 0.0
+        largest = max(largest, (difference, place))
+    return Difference(*largest, tuple(others))
+
+
+def _without_numbers(value: Any) -> Any:
+    return NUMBER.sub("#", value) if isinstance(value, str) else value
 
 
 def _pairs(now: Any, before: Any, place: str) -> Iterator[tuple[str, Any, Any]]:

@@ -233,10 +233,11 @@ def test_a_drawn_component_moves_an_output_by_as_much_as_drawn() -> None:
 
 def test_reports_are_the_same_only_bit_for_bit() -> None:
     before = [{"decision": "learned", "fit": {"cost": 1.0, "notes": ["a"]}}]
-    assert reports.compare(before, before) == reports.Difference(0.0, ())
+    assert reports.compare(before, before) == reports.Difference(0.0, "", ())
     near = reports.compare([{"decision": "learned", "fit": {"cost": 1.0 + 1e-9, "notes": ["a"]}}], before)
     assert near.is_close
     assert near.largest > 0.0
+    assert near.place == "/0/fit/cost"
     far = [{"decision": "learned", "fit": {"cost": 1.1, "notes": ["a"]}}]
     other = [{"decision": "learned", "fit": {"cost": 1.0, "notes": ["a", "b"]}}]
     assert not any(reports.compare(own, before).is_close for own in (far, other, [], [{"decision": "learned"}]))

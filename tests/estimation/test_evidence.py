@@ -17,7 +17,7 @@ from otolith.estimation.evidence import (
     penalty,
     prior_deviance,
 )
-from otolith.estimation.information import chi_square_left
+from otolith.estimation.linearised import chi_square_left
 
 RECORDS, VALUES = 40, 5
 

@@ -18,7 +18,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
-from otolith.estimation.information import orthonormal_basis
+from otolith.estimation.linearised import Elimination
 from otolith.estimation.minimisers import continued
 from otolith.estimation.window_fit import ALONE_STEPS, Fit
 from otolith.twin.definition import Input
@@ -155,16 +155,14 @@ def _limited(own: Correlation) -> Correlation:
 
 def _correlation(fit: FittedWindow, name: str, level: float, draws: int, random: np.random.Generator) -> Correlation:
     """Return the correlation of a window; so many ``draws`` of noise of that ``level`` give what is expected."""
-    window, basis, response = fit.window, orthonormal_basis(fit.result.jacobian), _response_to(fit, name)
-    fast = response(_fast(window, window.column(name)))
-    fast -= basis @ (basis.T @ fast)
+    window, unknowns, response = fit.window, Elimination.of(fit.result.jacobian), _response_to(fit, name)
+    fast = unknowns.left(response(_fast(window, window.column(name))))
     power = float(fast @ fast)
     if not MIN_POWER <= power < np.inf:  # false where the twin diverges
         return Correlation()
     expected = 0.0
     for noise in level * random.standard_normal((draws, window.records)):
-        moved = response(noise)
-        expected += float((moved - basis @ (basis.T @ moved)) @ response(_fast(window, noise)))
+        expected += float(unknowns.left(response(noise)) @ response(_fast(window, noise)))
     observed, variance = float(fit.result.residuals @ fast), fit.discount * power
     own = Correlation(observed, expected / draws / level**2, variance, level, 1)
     return own if np.isfinite(expected) else Correlation()

@@ -35,7 +35,8 @@ from otolith.discovery.linear_response import (
 from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
 from otolith.estimation.evidence import DECISIVE
-from otolith.estimation.information import initial_prior, orthonormal_basis
+from otolith.estimation.information import initial_prior
+from otolith.estimation.linearised import Elimination
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
 from otolith.estimation.window_fit import Fit, fit
@@ -99,7 +100,7 @@ class PooledResponse(ProjectedResponse):
         """(windows,) rows of the residual at which the windows end."""
         free, rows = len(first.problem.free), list(map(_rows_of_window, fits))
         self._start = fits[0].parameters
-        states = [orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows]
+        states = [Elimination.of(jacobian[:, 2 * free :]).basis for _, jacobian in rows]
         widest = max(basis.shape[1] for basis in states)
         self._states = self.by_window(
             np.vstack([np.pad(basis, ((0, 0), (0, widest - basis.shape[1]))) for basis in states])
@@ -145,9 +146,9 @@ class PooledResponse(ProjectedResponse):
     def explain(self, columns: Array) -> None:
         """Project out what ``columns`` (residuals, columns) explain."""
         columns = columns - self._basis @ (self._basis.T @ columns)
-        further = orthonormal_basis(columns)
-        self._basis = np.hstack([self._basis, further])
-        self._remainder = self._remainder - further @ (further.T @ self._remainder)
+        further = Elimination.of(columns)
+        self._basis = np.hstack([self._basis, further.basis])
+        self._remainder = further.left(self._remainder)
         self.chi_square = float(self._remainder @ self._remainder)
 
     def by_window(self, columns: Array) -> Array:

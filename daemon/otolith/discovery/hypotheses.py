@@ -19,7 +19,8 @@ from otolith.estimation.evidence import (
     penalty,
     prior_deviance,
 )
-from otolith.estimation.information import Prior, extend_prior, initial_prior, orthonormal_basis
+from otolith.estimation.information import Prior, extend_prior, initial_prior
+from otolith.estimation.linearised import Elimination
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, augment, indices
 from otolith.estimation.timing import delay_response, delayable
@@ -246,15 +247,12 @@ class DelayScore:
 def delay_score(fitted: Fit, signal: str) -> DelayScore:
     """Return the step of the delay of ``signal``, with what parameters, trends and initial state explain left out."""
     free, index = len(fitted.problem.free), delayable(fitted.problem.base_model).index(signal)
-    jacobian, residuals = fitted.result.jacobian, fitted.result.residuals
+    unknowns, residuals = Elimination.of(fitted.result.jacobian), fitted.result.residuals
     of_window = delay_response(fitted.objective, fitted.guess)[:, index]
     response = np.concatenate([of_window, np.zeros(len(residuals) - len(of_window))])  # that of the prior is zero
-    basis = orthonormal_basis(jacobian)
-    projected = response - basis @ (basis.T @ response)
+    projected = unknowns.left(response)
     size = float(projected @ projected)
     if size <= MIN_DELAY_SHARE * float(response @ response):
         return DelayScore(0.0, 0.0, (0.0,) * (2 * free))
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    shift = -np.linalg.lstsq(jacobian / scale, response, rcond=None)[0] / scale
     step, information = -float(projected @ residuals) / size, size / fitted.discount
-    return DelayScore(step, information, tuple(shift[: 2 * free].tolist()))
+    return DelayScore(step, information, tuple((-unknowns.explaining(response))[: 2 * free].tolist()))

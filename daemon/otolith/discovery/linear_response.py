@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.data_checks import median
-from otolith.estimation.information import chi_square_left, orthonormal_basis
+from otolith.estimation.linearised import Elimination, chi_square_left
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
@@ -149,16 +149,11 @@ class LinearResponse(ProjectedResponse):
         self.count = self.objective.count
         start, residuals, jacobian = fitted.result.first
         self._guess = self.objective.without_trends(start)
-        self._project(residuals, jacobian, len(residuals) - len(fitted.prior.mean))
-        self._linearise_slots()
-
-    def _project(self, residuals: Array, jacobian: Array, window_rows: int) -> None:
-        """Project out what parameters, trends and initial state explain; the last rows are those of the prior."""
-        basis = orthonormal_basis(jacobian)
-        remainder = residuals - basis @ (basis.T @ residuals)
+        self._unknowns, rows = Elimination.of(jacobian), len(residuals) - len(fitted.prior.mean)  # below is the prior
+        remainder = self._unknowns.left(residuals)
         self.chi_square = float(remainder @ remainder)
-        self._remainder, self._basis = remainder[:window_rows], basis[:window_rows]
-        self._prior_basis = basis[window_rows:]
+        self._remainder, self._basis = remainder[:rows], self._unknowns.basis[:rows]
+        self._linearise_slots()
 
     def _linearise_slots(self) -> None:
         """Linearise the twin with slots along the predicted trajectory, and evaluate the sources there."""
@@ -250,10 +245,8 @@ class LinearResponse(ProjectedResponse):
         return self._adjoint(self._linear)
 
     def _adjoint(self, linear: LinearisedModel) -> Array:
-        rows = len(self._basis) + len(self._prior_basis)
-        vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, rows)
-        shared = self._basis.T @ vectors[: len(self._basis)] + self._prior_basis.T @ vectors[len(self._basis) :]
-        probes = vectors[: len(self._basis)] - self._basis @ shared
+        vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, len(self._unknowns.basis))
+        probes = self._unknowns.left(vectors)[: len(self._basis)]
         signals = np.concatenate([self._remainder[:, None], probes], axis=1)
         return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, signals)
 

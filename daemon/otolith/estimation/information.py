@@ -20,6 +20,7 @@ from itertools import islice
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
+from otolith.estimation.linearised import Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -27,7 +28,6 @@ from otolith_drivers.units import unit_text
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
 MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not observed
-MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
 MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: with a wider one it is open whether the value is beyond the bound
@@ -42,7 +42,6 @@ CORRELATED = 3.0  # standard deviations of sums of autocovariances of white nois
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
-MIN_STATE_SINGULAR = 1e-10  # relative singular value below which a window does not determine the initial state
 MIN_CURVED_SINGULAR = 1e-12  # relative singular value below which a direction is not determined, and has no curvature
 
 
@@ -147,28 +146,6 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     kept = directions[:, shares >= MIN_KEPT_INFORMATION]
     shares = np.where(shares >= MIN_KEPT_INFORMATION, np.minimum(shares, 1.0), INFORMATION_OF_NOISE)
     return (directions * shares) @ directions.T @ root, kept @ (kept.T @ (residual - bias))
-
-
-def orthonormal_basis(jacobian: Array) -> Array:
-    """Return an orthonormal basis (residuals, directions) of what a change of the guess can explain."""
-    size = np.linalg.norm(jacobian, axis=0)
-    alive = size > 0.0
-    basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
-    return np.asarray(basis[:, singular > MIN_BASIS_SINGULAR * singular.max(initial=0.0)])
-
-
-def chi_square_left(jacobian: Array, residuals: Array) -> float:
-    """Return χ² of what no change of the guess can explain: a triangular factor is faster than the basis.
-
-    If columns depend on each other, the factor would also leave out a direction that rounding chooses.
-    """
-    size = np.linalg.norm(jacobian, axis=0)
-    alive = size > 0.0
-    columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
-    diagonal = np.diag(np.linalg.qr(columns, mode="r"))
-    if len(diagonal) == columns.shape[1] and (np.abs(diagonal[:-1]) > MIN_BASIS_SINGULAR).all():
-        return float(diagonal[-1] ** 2)
-    return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
 
 
 def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
@@ -345,28 +322,18 @@ class MapObjective:
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
         curvature = linearisation_errors(self._objective, fit.guess[constant], fit.jacobian[:, constant])
-        of_states = jacobian[:, count:] * (self.high - self.low)[count:]
+        of_states = Elimination.of(jacobian[:, count:], 1.0 / (self.high - self.low)[count:])
         columns = np.concatenate([jacobian[:, :count], residuals[:, None], curvature], axis=1)  # J, r, N
-        columns = eliminate_states(columns, of_states)
+        columns = of_states.left(columns)
         basis, root = np.linalg.qr(columns[:, :count])  # J = QR
         rotated = basis.T @ columns[:, count:]
         residual, noise = rotated[:, 0], rotated[:, 1:]  # b and N, in the directions that R measures
         if has_noisy_inputs:
             moved = self._objective.changes_by_input_noise(fit.guess, residuals, jacobian)
-            parts = (eliminate_states(np.delete(rows, np.s_[count:-1], axis=1), of_states) for rows in moved)
+            parts = (of_states.left(np.delete(rows, np.s_[count:-1], axis=1)) for rows in moved)
             root, residual = without_input_noise(root, residual, parts)  # R' and b'
         root, residual = _with_noise(root / inflation, residual / inflation, noise)
         return Evidence(fit.guess[:count], root, residual)
-
-
-def eliminate_states(rows: Array, slopes: Array) -> Array:
-    """Return ``rows`` (residuals, columns) minus their projection on what the initial state can explain.
-
-    ``slopes`` (residuals, states) are the derivatives by the initial state, relative to the width of its bounds.
-    """
-    states, singular, _ = np.linalg.svd(slopes, full_matrices=False)
-    basis = states[:, singular > MIN_STATE_SINGULAR * max(singular.max(initial=0.0), 1.0)]
-    return np.asarray(rows - basis @ (basis.T @ rows))
 
 
 def linearisation_errors(objective: Objective, guess: Array, jacobian: Array) -> Array:
