@@ -167,7 +167,7 @@ def _information(structure: CandidateForm, inner: float, phase: float, landscape
     """Information about the amplitude: gain of the fit per squared amplitude, independent of the noise."""
     at_phase = structure._replace(model=replace(structure.model, phases=(phase,)))
     curve = basis_functions([(at_phase, inner)])
-    gains = landscape.score_responses(landscape.responses(curve), np.zeros((1, 2), dtype=np.int64))
+    gains = landscape.score_responses(landscape.responses(curve))
     amplitude: float = gains.amplitudes[0, 0]
     return float(gains.gain[0] / amplitude**2) if amplitude else 0.0
 

@@ -9,6 +9,7 @@ from otolith.estimation.evidence import (
     CHANCE,
     LEVEL_ERROR,
     LogEvidence,
+    chi_square_left,
     chi_square_limit,
     discount,
     is_explained,
@@ -17,7 +18,6 @@ from otolith.estimation.evidence import (
     penalty,
     prior_deviance,
 )
-from otolith.estimation.linearised import chi_square_left
 
 RECORDS, VALUES = 40, 5
 

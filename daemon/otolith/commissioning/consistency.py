@@ -25,7 +25,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood
-from otolith.estimation.linearised import Elimination
+from otolith.estimation.evidence import Elimination
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_INFORMATION = 2.0  # prior standard deviations per one of the window: below it, a direction is not determined
@@ -257,7 +257,7 @@ def sqrt_information(fit: FittedWindow, width: Array) -> Array:
     The initial state is eliminated. Residuals larger than the noise reduce the information.
     """
     free = fit.objective.free
-    states = Elimination.of(fit.result.jacobian[:, free:], 1.0 / width[free:])
+    states = Elimination.of(fit.result.jacobian[:, free:], width[free:])
     own = states.left(fit.result.jacobian[:, :free] * width[:free])
     _, singular, directions = np.linalg.svd(own, full_matrices=False)
     singular = singular / np.sqrt(fit.discount)

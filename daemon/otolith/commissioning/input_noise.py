@@ -18,7 +18,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
-from otolith.estimation.linearised import Elimination
+from otolith.estimation.evidence import Elimination
 from otolith.estimation.minimisers import continued
 from otolith.estimation.window_fit import ALONE_STEPS, Fit
 from otolith.twin.definition import Input

@@ -34,9 +34,8 @@ from otolith.discovery.linear_response import (
 )
 from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
-from otolith.estimation.evidence import DECISIVE
+from otolith.estimation.evidence import DECISIVE, Elimination
 from otolith.estimation.information import initial_prior
-from otolith.estimation.linearised import Elimination
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
 from otolith.estimation.window_fit import Fit, fit

@@ -14,13 +14,13 @@ from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
 from otolith.estimation.evidence import (
     STRUCTURE,
+    Elimination,
     LogEvidence,
     discount,
     penalty,
     prior_deviance,
 )
 from otolith.estimation.information import Prior, extend_prior, initial_prior
-from otolith.estimation.linearised import Elimination
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, augment, indices
 from otolith.estimation.timing import delay_response, delayable

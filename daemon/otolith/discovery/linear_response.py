@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.data_checks import median
-from otolith.estimation.linearised import Elimination, chi_square_left
+from otolith.estimation.evidence import Elimination, chi_square_left
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
@@ -111,22 +111,24 @@ class ProjectedResponse(ABC):
         pairs = np.array([first, first + counts - 1]).T
         return self.score_responses(self.responses(basis_functions(guesses)), pairs)
 
-    def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
-        """Return the statistics of ``responses`` (residuals, curves).
+    def score_responses(self, responses: Array, pairs: Array | None = None) -> ScoreStatistics:
+        """Return the statistics of ``responses`` (residuals, curves): those of all first-order scores.
 
-        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes a solve the
+        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice; by default, each curve is a
+        guess. The amplitudes a solve the
         normal equations N a = b of one or two curves after projection, and the gain is bᵀ a.
         """
+        own = np.arange(responses.shape[1])
+        first, second = np.array([own, own]) if pairs is None else pairs.T
         with np.errstate(all="ignore"):
             products = self._remainder @ responses  # b of each curve
             in_basis = self._basis.T @ responses
             whole = np.einsum("rc,rc->c", responses, responses)
             squares = whole - np.einsum("bc,bc->c", in_basis, in_basis)  # diagonal of N
             squares = np.where(squares > MIN_REMAINDER * whole, squares, np.inf)
-            first, second = pairs.T
             single = first == second
             one, two = first[~single], second[~single]
-            cross = np.zeros(len(pairs))  # off the diagonal of N
+            cross = np.zeros(len(first))  # off the diagonal of N
             cross[~single] = np.einsum("rg,rg->g", responses[:, one], responses[:, two])
             cross[~single] -= np.einsum("bg,bg->g", in_basis[:, one], in_basis[:, two])
             n_11, n_22 = squares[first], np.where(single, np.inf, squares[second])
@@ -268,15 +270,13 @@ class LinearResponse(ProjectedResponse):
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""
-        one = np.arange(len(names))
-        return self.score_responses(self._parameter_responses(names), np.column_stack([one, one])).gain
+        return self.score_responses(self._parameter_responses(names)).gain
 
     def score_delays(self) -> ScoreStatistics:
         """Return by how much χ² falls if each output, then each input, is late alone; amplitudes are in seconds."""
         twin = self.problem.base_model
-        columns = -delay_response(self.objective, self._guess)[:, : len(twin.outputs) + len(twin.inputs)]
-        one = np.arange(columns.shape[1])
-        return self.score_responses(columns, np.column_stack([one, one]))
+        responses = -delay_response(self.objective, self._guess)
+        return self.score_responses(responses[:, : len(twin.outputs) + len(twin.inputs)])
 
     def is_parameter(self, curves: BasisFunctions, amplitudes: Array) -> Mask:
         """Return which curves (curves,) of these ``amplitudes`` a parameter within its bounds would produce as well."""

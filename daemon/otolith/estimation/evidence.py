@@ -30,6 +30,7 @@ CHANCE = 1e-9  # probability of what noise alone does not do
 EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
 ROUNDING = 1e-12  # share of a limit up to which it is computed
 STRUCTURE = 1.5  # RMSE over the noise, with the correlation of what is left, above which that is more than noise
+MIN_EXPLAINED = 1e-10  # relative singular value of a direction that a change of the unknowns explains
 NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 
 
@@ -65,6 +66,50 @@ def discount(chi_square: float, count: float) -> float:
     That is how many times the variance of the noise it leaves; at least one.
     """
     return max(chi_square / count, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Elimination:
+    """The unknowns of a linearised window, to be eliminated from residuals and responses."""
+
+    basis: Array  # (residuals, directions) orthonormal: what a change of the unknowns explains
+    steps: Array  # (unknowns, directions) the changes that do
+
+    @classmethod
+    def of(cls, jacobian: Array, width: Array | None = None) -> "Elimination":
+        """Return the elimination of unknowns with the derivatives ``jacobian`` (residuals, unknowns).
+
+        ``width`` (unknowns,) is the unit in which each counts: a direction that then has less effect than rounding
+        explains nothing. By default it is what has an effect of one; an unknown without effect is none.
+        """
+        if width is None:
+            size = np.linalg.norm(jacobian, axis=0)
+            width = np.divide(1.0, size, out=np.zeros(len(size)), where=size > 0.0)
+        basis, singular, directions = np.linalg.svd(jacobian * width, full_matrices=False)
+        kept = singular > MIN_EXPLAINED * max(singular.max(initial=0.0), 1.0)
+        return cls(basis[:, kept], (directions[kept] / singular[kept, None] * width).T)
+
+    def left(self, rows: Array) -> Array:
+        """Return what is left of ``rows`` (residuals, ...)."""
+        return np.asarray(rows - self.basis @ (self.basis.T @ rows))
+
+    def explaining(self, rows: Array) -> Array:
+        """Return the change (unknowns, ...) that explains most of ``rows`` (residuals, ...)."""
+        return np.asarray(self.steps @ (self.basis.T @ rows))
+
+
+def chi_square_left(jacobian: Array, residuals: Array) -> float:
+    """Return χ² of what the elimination leaves of ``residuals``: a triangular factor is faster than the basis.
+
+    If columns depend on each other, the factor would also leave out a direction that rounding chooses.
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    alive = size > 0.0
+    columns = np.column_stack([jacobian[:, alive] / size[alive], residuals])
+    diagonal = np.diag(np.linalg.qr(columns, mode="r"))
+    if len(diagonal) == columns.shape[1] and (np.abs(diagonal[:-1]) > MIN_EXPLAINED).all():
+        return float(diagonal[-1] ** 2)
+    return float((Elimination.of(jacobian).left(residuals) ** 2).sum())
 
 
 @lru_cache(maxsize=256)

@@ -20,7 +20,7 @@ from itertools import islice
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
-from otolith.estimation.linearised import Elimination
+from otolith.estimation.evidence import Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -322,7 +322,7 @@ class MapObjective:
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
         curvature = linearisation_errors(self._objective, fit.guess[constant], fit.jacobian[:, constant])
-        of_states = Elimination.of(jacobian[:, count:], 1.0 / (self.high - self.low)[count:])
+        of_states = Elimination.of(jacobian[:, count:], (self.high - self.low)[count:])
         columns = np.concatenate([jacobian[:, :count], residuals[:, None], curvature], axis=1)  # J, r, N
         columns = of_states.left(columns)
         basis, root = np.linalg.qr(columns[:, :count])  # J = QR

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array
-from otolith.estimation.linearised import Elimination, chi_square_left
+from otolith.estimation.evidence import Elimination, chi_square_left
 
 
 def jacobian(kind: str, random: np.random.Generator) -> Array:
