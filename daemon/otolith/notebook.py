@@ -25,9 +25,12 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import Replay, open_recordings
 from otolith.runtime.simulation_inputs import PlannedRows, RecordedStretch, read_inputs, read_recorded
 from otolith.simulation import what_if
+from otolith.simulation.export_modelica import modelica_text
+from otolith.simulation.export_python import python_text
+from otolith.simulation.exported import ExportedTwin, exported_twin
 from otolith.simulation.plan import joined, planned_window
 from otolith.simulation.prediction import Prediction
-from otolith.simulation.simulate import simulate
+from otolith.simulation.simulate import simulate, substeps_of
 from otolith.storage.history import MINUTE, RESOLUTIONS, HistoryReader, HistorySample, history_path
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
@@ -370,6 +373,31 @@ class Twin:
             parts.append((window.start + window.grid.offsets, window.measured(names), predicted, fitted.innovations))
         times, measured, predicted, normalised = (np.concatenate(column) for column in zip(*parts, strict=True))
         return Residuals(names, tuple(self.outputs.values()), times, measured, predicted, normalised)
+
+    def python(self) -> str:
+        """Return the twin as a Python program that needs NumPy alone: equations, values with intervals, an integrator.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: no window was learned from yet.
+        """
+        twin, notes = self._exported()
+        return python_text(twin, notes, substeps_of(self.posterior))
+
+    def modelica(self) -> str:
+        """Return the twin as a Modelica model; raises as :meth:`python`."""
+        twin, notes = self._exported()
+        return modelica_text(twin, notes, f"{self.machine.file.machine.name}_adapted")
+
+    def _exported(self) -> tuple[ExportedTwin, tuple[str, ...]]:
+        """Return what is exported, and of which machine and time it is."""
+        try:
+            twin = exported_twin(self.posterior)
+        except ValueError as error:
+            remedy = "run the daemon, or adapt the twin to a recording"
+            raise ConfigurationError(f"{self.machine.path}: {error}: {remedy}") from error
+        when = _moment_text(self.time or 0.0, self.learned.plan.timezone)
+        supposed = tuple(f"Supposed: {line}" for line in self.supposed)
+        return twin, (f"Machine: {self.machine.title}, learned until {when}.", *supposed)
 
     def __str__(self) -> str:
         """Machine, parameters and components, a line each."""

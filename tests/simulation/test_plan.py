@@ -52,7 +52,7 @@ def test_windows_are_joined_up_to_the_first_gap() -> None:
     assert joined(windows).grid.period == PERIOD
 
 
-@pytest.mark.parametrize("spread", [0.01, 0.4, 3.0, 50.0])
+@pytest.mark.parametrize("spread", [0.01, 0.4, 3.0, 50.0, 300.0])
 def test_the_ends_of_a_band_are_quantiles_of_the_mixture(spread: float) -> None:
     """Of normal draws, and of the positions of a sine whose phase is not known: two peaks."""
     normal = spread * norm.ppf((np.arange(400) + 0.5) / 400)

@@ -98,7 +98,7 @@ def _quantile(draws: Array, sd: float, probability: float, guess: Array) -> Arra
         below = excess < 0.0
         low[open_[below]], high[open_[~below]] = at[open_[below]], at[open_[~below]]
         density = np.exp(-0.5 * deviation**2).mean(axis=1) / (sd * np.sqrt(2.0 * np.pi))
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # far from all draws the density is 0
             step = at[open_] - excess / density
         is_inside = (step > low[open_]) & (step < high[open_])
         moved = np.where(is_inside, step, 0.5 * (low[open_] + high[open_]))

@@ -16,6 +16,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.simulation.draws import PAIRS, ParameterDraws, opposite, root_of
 from otolith.simulation.initial_state import last_state, state_covariance
+from otolith.simulation.plan import planned_window
 from otolith.simulation.prediction import Prediction, bands
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -23,6 +24,7 @@ CHUNK = 256  # records whose draws are kept until their bands are known: bounds 
 MAX_MAGNITUDE = 1e30  # of a draw: a larger one has diverged
 # Thresholds: docs/reference/thresholds-simulation.md has the origin of each.
 MAX_STEPS = 64  # substeps of a record, at most
+STEP_RECORDS, TRIED_STEPS = 20, 6  # length and number of the steps of inputs
 TRIED_RECORDS = 2000  # from which the number of substeps is found
 
 
@@ -37,6 +39,17 @@ def simulate(state: Posterior, window: Window, seed: int = 1) -> Prediction:
         ValueError: no window has been learned from yet, or the twin diverges at once.
     """
     return _Simulation.of(state.at_last_record(), window, seed).prediction()
+
+
+def substeps_of(state: Posterior) -> int:
+    """Return the substeps of a sample period that resolve steps of all inputs over their ranges; raises as simulate."""
+    twin, period = state.problem.base_model, state.problem.window.sample_period or 0.0
+    ends = np.array([(item.low, item.high) for item in twin.inputs]).reshape(-1, 2)
+    times, columns = period * np.arange(TRIED_STEPS * STEP_RECORDS, dtype=np.float64), {}
+    for item, (low, high) in zip(twin.inputs, ends, strict=True):
+        columns[item.name] = np.where(np.arange(len(times)) // STEP_RECORDS % 2, high, low)
+    window = planned_window(twin, times, columns, period, 0.0)
+    return _Simulation.of(state.at_last_record(), window, seed=0).substeps
 
 
 @dataclass(slots=True, eq=False)

@@ -1,11 +1,11 @@
-"""``otolith twin``: the library of twins, one twin as a page of equations, and the check of a user's own twin."""
+"""``otolith twin``: the library of twins, one as a page of equations or for other tools, the check of a user's own."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from otolith.cli.common import AS_JSON, FILE
+from otolith.cli.common import AS_JSON, FILE, MACHINE_FILE, new_file, use_state_of_service
 from otolith.cli.terminal import echo, echo_json
 
 if TYPE_CHECKING:
@@ -16,13 +16,14 @@ MIN_WIDTH = 100  # columns; narrower tables of parameters are hard to read, also
 
 @click.group()
 def twin() -> None:
-    """List, show and check twins, the equations of machines.
+    """List, show, check and export twins, the equations of machines.
 
     \b
     Examples:
       otolith twin list
       otolith twin show dc_motor
       otolith twin check my-twin.toml
+      otolith twin export press-3 --modelica
     """
 
 
@@ -127,3 +128,39 @@ def _print(definition: "Definition") -> None:
     for site in definition.sites:
         signals.add_row(site.name, f"site, {site.mode} into {site.into}", site.unit, site.meaning)
     console.print(signals)
+
+
+@twin.command()
+@MACHINE_FILE
+@click.option("--python", "language", flag_value="python", help="As a Python program that needs NumPy alone.")
+@click.option("--modelica", "language", flag_value="modelica", help="As a Modelica model.")
+@click.option("--after", "recordings", type=FILE, multiple=True, metavar="DATA",
+              help="Adapt the twin to this recording, not to what a daemon has learned; may be repeated.")  # fmt: skip
+@click.option("--output", type=FILE, callback=new_file, metavar="FILE", help="Write this new file instead of printing.")
+def export(file: Path, language: str | None, recordings: tuple[Path, ...], output: Path | None) -> None:
+    """Print the adapted twin of a machine with its discovered components.
+
+    The text has the equations, the values with their intervals, and where each is
+    from. It can be read, changed and run without Otolith.
+
+    \b
+    Examples:
+      otolith twin export press-3 --python > press_3.py
+      otolith twin export press-3 --modelica --output press_3.mo
+      otolith twin export my-machine.toml --after monday.csv --python
+    """
+    from otolith.cli.common import progress_line
+    from otolith.cli.operation.history import write_page
+    from otolith.notebook import Twin
+
+    if language is None:
+        raise click.UsageError("give --python or --modelica")
+    use_state_of_service(file)
+    with progress_line("exporting"):
+        adapted = Twin.load(file)
+        adapted = adapted.adapted(*recordings) if recordings else adapted
+        text = adapted.python() if language == "python" else adapted.modelica()
+    if output is None:
+        echo(*text.rstrip("\n").split("\n"))
+    else:
+        write_page(output, text.encode())
