@@ -7,8 +7,9 @@ import pytest
 
 from otolith.cli.commissioning.check import lines_without_limits
 from otolith.cli.commissioning.commission import written_value
+from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import MonitoringPlan
-from otolith.health.events import HealthState, assess
+from otolith.health.events import KNOWN_WINDOWS, HealthState, assess
 from otolith.health.limits import Level
 from otolith.health.prognosis import Baseline, with_baselines
 from otolith.health.schema import (
@@ -16,6 +17,7 @@ from otolith.health.schema import (
     FindingKind,
     NumberDocument,
     ParameterDocument,
+    PartDocument,
     ReportDocument,
     Severity,
     Status,
@@ -24,6 +26,7 @@ from otolith.health.text import headline, value_cells
 from otolith.machine import LIBRARY, LoadedMachine, load_machine
 from otolith_drivers.grammars.toml_lines import toml_value
 from tests.health.test_events import report
+from tests.health.test_hints import agreeing
 from tests.messages import assert_says
 
 WITHOUT_LOAD_SENSOR = (
@@ -181,3 +184,42 @@ def test_what_commissioning_writes_of_motor_and_load_is_judged(tmp_path: Path) -
     assert not shown(plan, R_a=6.5, D=0.004).events
     (event,) = shown(plan, R_a=6.5, D=0.0085).events
     assert (event.part, event.state) == ("bearing", Level.ACT)
+
+
+EXAMPLE = '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n'
+STATED = "[parameters]\n" + "".join(
+    f'{name} = "{value}"\n'
+    for name, value in {"L_a": "0.6 H", "J": "12 kg*cm^2", "K_e": "0.04 V*s/rad", "K_t": "0.04 N*m/A"}.items()
+)
+
+
+def parts_of(document: ReportDocument) -> Mapping[str, PartDocument]:
+    assert document.health is not None
+    return document.health.parts
+
+
+def after_windows_that_do_not_fit(plan: MonitoringPlan, fitting: int, twice: int = 1) -> ReportDocument:
+    """The last report, of windows of which ``fitting`` agree and then, each ``twice``-th, nothing explains."""
+    state, document = HealthState(), report(0)
+    for index in range(fitting + 24):
+        fits = index < fitting or index % twice
+        (window,) = agreeing(1, index) if fits else [report(index, decision=WindowDecision.REFUSED)]
+        state, document = assess(plan, state, window)
+    return document
+
+
+@pytest.mark.parametrize("twice", [1, 4], ids=["unexplained", "returns"])
+@pytest.mark.parametrize(
+    ("written", "fitting", "level"),
+    [("", 0, Level.HINT), (STATED, 0, Level.WATCH), ("", 2 * KNOWN_WINDOWS, Level.WATCH)],
+    ids=["example", "stated", "agreed before"],
+)
+def test_what_does_not_fit_an_example_from_the_start_is_a_hint(
+    written: str, fitting: int, level: Level, twice: int, tmp_path: Path
+) -> None:
+    """The daemon runs so after 'otolith init', until the machine is commissioned."""
+    document = after_windows_that_do_not_fit(machine_of(tmp_path, EXAMPLE + written).plan, fitting, twice)
+    (event,) = (item for item in document.events if item.end is None)
+    assert event.state is level
+    assert all(name in event.setting for name in ("L_a", "J", "K_e", "K_t") if level is Level.HINT)
+    assert (Level.WATCH in {part.state for part in parts_of(document).values()}) is (level is Level.WATCH)

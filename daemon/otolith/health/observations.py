@@ -40,6 +40,8 @@ PARTS = {
 }
 """Of the findings that are about no part of the twin."""
 FROM_START = "from the start"  # Manner of what was so before the signals agreed with the machine file for long
+BY_THE_TWIN = frozenset({FindingKind.UNEXPLAINED, FindingKind.RETURNS, FindingKind.COMPONENT, FindingKind.CLASS})
+"""What only the comparison with the twin shows."""
 NOTHING = FindingFeatures(FindingKind.OPEN)
 
 
@@ -116,7 +118,21 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
             observations.append(_of_finding(plan, report.twin, finding, before, past))
-    return observations
+    return [_of_example(plan, item, report.window.start, past) for item in observations]
+
+
+def _of_example(plan: MonitoringPlan, observed: Observation, start: float, past: Past) -> Observation:
+    """Return an observation as a hint if the twin computes with values of an example, and so did from the start.
+
+    What does not fit is then the machine file to complete, and nothing has happened to the machine.
+    """
+    examples = [name for name, quantity in plan.known.items() if quantity.is_example]
+    begin = start if observed.since is None else observed.since
+    is_from_start = past.known_since is None or begin < past.known_since
+    is_warning = observed.level in (Level.WATCH, Level.ACT) and observed.features.finding in BY_THE_TWIN
+    if not examples or not is_from_start or not is_warning:
+        return observed
+    return replace(observed, level=Level.HINT, setting=plan.texts("example_values", names=", ".join(examples)))
 
 
 def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
