@@ -24,6 +24,7 @@ from otolith.adaptation.state import (
     initial_state,
     with_problem,
 )
+from otolith.discovery.decision import Approval
 from otolith.estimation.imm_filter import UNKNOWN_AWAY, ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
@@ -368,6 +369,22 @@ def test_a_change_of_the_machine_file_keeps_the_components_alone(tmp_path: Path)
     assert "parameters or noise in the machine file have changed" in note
     (backup,) = tmp_path.glob("*.kept.json")
     assert json.loads(backup.read_text(encoding="utf-8")) == document
+
+
+@pytest.mark.parametrize("approval", [Approval.OPEN, Approval.APPROVED])
+def test_other_known_values_keep_only_what_somebody_approved(approval: Approval, tmp_path: Path) -> None:
+    """A component that was found with the values of an example may explain nothing but them."""
+    state = unbalanced()
+    store = store_in(tmp_path)
+    store.save(replace(state, adopted=tuple(replace(item, approval=approval) for item in state.adopted)))
+    known = tuple((name, 1.1 * value) for name, value in PROBLEM.known)
+    initial = replace(fresh(), posterior=type(fresh().posterior).initial(replace(PROBLEM, known=known)))
+    warm, note = store.restore(initial)
+    kept = [component.key for component in warm.problem.components]
+    assert kept == ([UNBALANCE] if approval is Approval.APPROVED else [])
+    dropped = [event.id.partition("@")[0] for event in warm.health.dropped]
+    assert dropped == ([] if approval is Approval.APPROVED else ["component/shaft/periodic"])
+    assert all("parameters or noise in the machine file have changed" in (item.reason or "") for item in warm.health.dropped)
 
 
 def test_files_of_version_1_are_read(tmp_path: Path) -> None:

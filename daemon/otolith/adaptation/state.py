@@ -219,6 +219,11 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
     return state
 
 
+def event_key(component: Component) -> str:
+    """Return the key of the condition that a component is; see :func:`otolith.health.observations.observe`."""
+    return f"component/{component.site}/{component.family}"
+
+
 def _removed(state: AdaptationState, component: Component, reason: str) -> AdaptationState:
     """Return the state without a component, whose event is dropped unless another one is at the same place."""
     state = without_component(state, component)
@@ -226,8 +231,7 @@ def _removed(state: AdaptationState, component: Component, reason: str) -> Adapt
         (item.component.site, item.component.family) == (component.site, component.family) for item in state.adopted
     ):
         return state
-    key = f"component/{component.site}/{component.family}"
-    return replace(state, health=state.health.without_events({key}, reason))
+    return replace(state, health=state.health.without_events({event_key(component)}, reason))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,15 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
+from otolith.adaptation.state import (
+    AdaptationState,
+    ComponentRecord,
+    cleared,
+    component_records,
+    event_key,
+    restore_components,
+)
+from otolith.discovery.decision import Approval
 from otolith.estimation.imm_filter import (
     HIGHEST_LEVEL,
     MAX_VARIANCE_RATIO,
@@ -98,6 +106,7 @@ class LearnedState(StrictModel):
     signal_fingerprint: str = ""  # See otolith.machine.LoadedMachine.signal_fingerprint
     twin_fingerprint: str = ""
     configuration_fingerprint: str = ""
+    values_fingerprint: str = ""  # Empty in older files
     resets: dict[str, float] = Field(default_factory=dict)  # See otolith.adaptation.state.AdaptationState.resets
     components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
     health: HealthState = Field(default_factory=HealthState)
@@ -152,6 +161,20 @@ def configuration_fingerprint(problem: Problem) -> str:
     return _hash([free, known, noise, problem.open_loop])
 
 
+def values_fingerprint(problem: Problem) -> str:
+    """Return a hash of the values of the known parameters, with which a component is found."""
+    return _hash([pair for pair in problem.known if not pair[0].startswith("_")])
+
+
+def without_open_components(learned: LearnedState, reason: str) -> LearnedState:
+    """Return what was learned without the components that nobody has approved; their events are dropped."""
+    kept = tuple(item for item in learned.components if item.adopted.approval is Approval.APPROVED)
+    lost = {event_key(item.adopted.component) for item in learned.components}
+    lost -= {event_key(item.adopted.component) for item in kept}
+    update = {"components": kept, "health": learned.health.without_events(lost, reason)}
+    return learned.model_copy(update=update)
+
+
 def _hash(content: list[object]) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
@@ -166,6 +189,7 @@ def learned_state(state: AdaptationState, signal_fingerprint: str, clock: SavedC
         signal_fingerprint=signal_fingerprint,
         twin_fingerprint=twin_fingerprint(base),
         configuration_fingerprint=configuration_fingerprint(state.problem),
+        values_fingerprint=values_fingerprint(state.problem),
         resets=dict(state.resets),
         components=component_records(state),
         health=state.health,

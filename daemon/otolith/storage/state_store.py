@@ -30,6 +30,8 @@ from otolith.storage.learned_state import (
     learned_state,
     restored,
     twin_fingerprint,
+    values_fingerprint,
+    without_open_components,
 )
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -250,6 +252,8 @@ class StateStore:
             if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
                 reason = "parameters or noise in the machine file have changed since it was saved"
                 learned = learned.model_copy(update={"filter": None, "health": learned.health.without_hints(reason)})
+                if learned.values_fingerprint not in ("", values_fingerprint(state.problem)):
+                    learned = without_open_components(learned, reason)
             return restored(learned, state), reason, False
         except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
             reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
