@@ -174,6 +174,10 @@ class Scale:
             text = f"{Decimal(text):f}" if abs(int(text.partition("e")[2])) <= MAX_ZEROS else _power_of_ten(text)
         return text if text in {"0", "-0"} else f"{text}{self.mark}"
 
+    def text(self, value: float, digits: int = 5) -> str:
+        """Return a number with its unit."""
+        return f"{self.number(value, digits)} {self.unit}".rstrip()
+
     def numbers(self, value: float, half: float | None) -> tuple[str, str]:
         """Return a value and half of its interval, rounded to the two digits of this; empty without an interval."""
         if half is None or not (0.0 < half < math.inf and math.isfinite(value)):

@@ -384,7 +384,9 @@ def test_other_known_values_keep_only_what_somebody_approved(approval: Approval,
     assert kept == ([UNBALANCE] if approval is Approval.APPROVED else [])
     dropped = [event.id.partition("@")[0] for event in warm.health.dropped]
     assert dropped == ([] if approval is Approval.APPROVED else ["component/shaft/periodic"])
-    assert all("parameters or noise in the machine file have changed" in (item.reason or "") for item in warm.health.dropped)
+    assert all(
+        "parameters or noise in the machine file have changed" in (item.reason or "") for item in warm.health.dropped
+    )
 
 
 def test_files_of_version_1_are_read(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ from otolith.publishing.zenoh_session import REPORT
 from otolith.runtime.process import ChildProcess
 from otolith.storage.history import path_in
 from otolith.storage.recording_files import STAMP
+from otolith_drivers.common.time_zones import local_moment
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
@@ -173,9 +174,8 @@ class Demo:
         self._machine, self._scenario = load_machine(machine), load_scenario(scenario)
         self._transports = transports_of(self._machine)
         self._scenario_file, self._duration, self._as_json = scenario, duration, as_json
-        begun, names = datetime.now().astimezone(), self._machine.file.machine
-        self._folder = writable(state_directory() / DEMOS / f"{begun.strftime(STAMP)}-{os.getpid()}")
-        stamp = begun.astimezone(UTC).strftime(STAMP)
+        stamp, names = datetime.now(UTC).strftime(STAMP), self._machine.file.machine
+        self._folder = writable(state_directory() / DEMOS / f"{stamp}-{os.getpid()}")
         self._recording = self._folder / f"{names.site}.{names.name}-{stamp}-{os.getpid()}.rrd"
         self._history = path_in(self._folder / "history", names.site, names.name)
         self._console = Terminal(stderr=as_json)
@@ -261,12 +261,15 @@ class Demo:
                 self._print_events(announcements(report))
                 self._print_plain(report)
 
+    def _time_of_day(self, seconds: float) -> str:
+        return f"{local_moment(seconds, self._machine.plan.timezone):%T}"
+
     def _print_plain(self, report: ReportDocument) -> None:
         """Print a report in a line, and in another one what is new while its cause is not yet known: once."""
-        self._print(brief(report, _time_of_day))
+        self._print(brief(report, self._time_of_day))
         undecided = undecided_finding(report)
         if undecided is not None and undecided.since != self._undecided:
-            self._print_wrapped(undecided_text(report, _time_of_day))
+            self._print_wrapped(undecided_text(report, self._time_of_day))
             self._undecided = undecided.since
 
     def _print_wrapped(self, text: str, style: str = "") -> None:
@@ -392,10 +395,6 @@ class Demo:
                 change = f"from {values} ({after / before - 1:+.1%})"
                 error = f"largest error {max(errors):.3%} in {len(errors)} windows"
                 self._print(f"{parameter.name} went {change}; {error}")
-
-
-def _time_of_day(seconds: float) -> str:
-    return time.strftime("%T", time.localtime(seconds))
 
 
 def _refuse_busy(endpoints: Sequence[str]) -> None:

@@ -36,7 +36,7 @@ from otolith.health.text import Texts, texts_in, zone_of
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
-from otolith_drivers.common.time_zones import local_moment
+from otolith_drivers.common.time_zones import comes_twice, local_moment
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
 
@@ -96,7 +96,7 @@ class Axis:
         ahead = 0 if offset is None else int(offset.total_seconds())
         first = math.ceil((self.begin + ahead) / step) * step - ahead
         times = (first + index * step for index in range(MAX_TICKS + 1))
-        return [(self.x(at), local_moment(at, self.zone).strftime(form)) for at in times if at <= self.end]
+        return [(self.x(at), _moment(at, self.zone, form)) for at in times if at <= self.end]
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ def html_report(
     )
     say = texts_in(latest.health.language if latest and latest.health else "en")
     is_dated = is_of_calendar(axis.begin)
-    own_when = (lambda seconds: f"{local_moment(seconds, axis.zone):%F %T}") if is_dated else clock_in(axis.zone)
+    own_when = (lambda seconds: _moment(seconds, axis.zone, "%F %T")) if is_dated else clock_in(axis.zone)
     own = {"when": own_when, "part": say.part}
     own["words"] = say.translated
     own["note"] = lambda written: whole(say.decimals(written))  # in the words of a person, whose times stay
@@ -191,6 +191,11 @@ def _conditions(
     """Return what the conditions of events mean, by the rules of the machine."""
     rules = (*reader.own_rules(), *load_rules(texts.language))
     return pages_of(dict.fromkeys(event.condition_id for event, _, _ in told), rules, texts)
+
+
+def _moment(seconds: float, zone: str | None, form: str) -> str:
+    """Return a local time, which names its zone in an hour that comes twice; the head of the page names that of all."""
+    return local_moment(seconds, zone).strftime(f"{form} %Z" if comes_twice(seconds, zone) else form)
 
 
 def whole(written: str) -> Markup:

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from datetime import UTC, datetime, tzinfo
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TextIO, cast
 
@@ -26,8 +26,7 @@ from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.database import EXTENDED_LIMIT
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CLASSIC_LENGTH
-from otolith_drivers.common.message_times import unix_time
-from otolith_drivers.common.time_zones import zone_named
+from otolith_drivers.common.time_zones import LocalDates, zone_named
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.replay import readers
 from otolith_drivers.replay.mf4 import Mf4Frames
@@ -57,10 +56,8 @@ logging.getLogger("can.io").setLevel(logging.ERROR)  # it warns of each bad line
 class CandumpLines:
     """The frames in what ``candump -ta`` or ``-tA`` prints; raises ValueError on a line that has none."""
 
-    zone: tzinfo = UTC  # Of the dates
-
     def __init__(self, lines: Iterator[str]) -> None:
-        self._lines = lines
+        self._lines, self.dates = lines, LocalDates()
 
     def __iter__(self) -> Iterator[can.Message]:
         for line in self._lines:
@@ -77,7 +74,7 @@ class CandumpLines:
                 raise ValueError("not as many bytes as it says")
             is_long, is_error = len(match["id"]) > STANDARD_DIGITS, bool(identifier & ERROR_FLAG)
             yield can.Message(
-                timestamp=_candump_time(match["time"], self.zone),
+                timestamp=_candump_time(match["time"], self.dates),
                 channel=match["channel"],
                 arbitration_id=identifier & EXTENDED_LIMIT,
                 is_extended_id=is_long and not is_error,
@@ -89,9 +86,9 @@ class CandumpLines:
             )
 
 
-def _candump_time(written: str, zone: tzinfo) -> float:
-    """Seconds; a date has no time zone, and is in ``zone``."""
-    return unix_time(datetime.fromisoformat(written), zone) if "-" in written else float(written)
+def _candump_time(written: str, dates: LocalDates) -> float:
+    """Seconds; a date has no time zone, and is the next of the ``dates``."""
+    return dates.seconds(datetime.fromisoformat(written)) if "-" in written else float(written)
 
 
 class SavvyCanLines:
@@ -178,15 +175,15 @@ def open_log(path: Path, setup: Setup, can: Any | None) -> "CanLogReader":
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
     if can is None:
         raise ConfigurationError(f"{path}: a CAN log: its frames need a description, like that of type = 'can'")
-    names, zone = tuple(signal.name for signal in setup.signals), zone_named(setup.timezone)
-    return CanLogReader(path, names, decoder_of(can, setup), zone)
+    names = tuple(signal.name for signal in setup.signals)
+    return CanLogReader(path, names, decoder_of(can, setup), setup.timezone)
 
 
 def frames_in(path: Path) -> Iterator[can.Message]:
     """The frames of a log; raise ConfigurationError as :class:`CanLogReader` does, or if it has none."""
     data, count = DataFile(path), 0
     with closing(data):
-        source = _frames_of(path, data)
+        source = _frames_of(path, data, LocalDates())
         for _, frame in source.frames():
             if not isinstance(frame, str) and abs(frame.timestamp) <= MAX_TIME:
                 count += 1
@@ -200,15 +197,16 @@ class CanLogReader(Reader):
 
     sampling = Sampling.CYCLIC
 
-    def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder, zone: tzinfo = UTC) -> None:
+    def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder, zone: str = "") -> None:
         """Open ``path``; raise ConfigurationError if the file is missing, or its format cannot be read.
 
-        ``zone`` is that of dates that name none.
+        ``zone`` names that of dates that name none.
         """
         data = DataFile(path)
         super().__init__(path, data)
         try:
-            self._source = _frames_of(path, data, zone)
+            self._dates = LocalDates(zone_named(zone) if zone else None)
+            self._source = _frames_of(path, data, self._dates)
         except BaseException:
             data.close()
             raise
@@ -306,7 +304,7 @@ class CanLogReader(Reader):
         if len(self._channels) > 1:
             names = ", ".join(sorted(self._channels))
             lines.append(f"frames of these messages come from channels {names}: are two machines mixed?")
-        lines += [*self._cut_off(), *self._source.notes]
+        lines += [*self._dates.warnings(), *self._cut_off(), *self._source.notes]
         # Frames that could not be used are already in the first line, with their place in the file.
         lines += self._decoder.warnings(self._latest, unused=False) if self._frames else []
         return [*lines, *filter(None, [self._decoder.defect(self._latest)])]
@@ -369,7 +367,7 @@ TEXT_FORMATS = {
 SUFFIXES = {".asc": readers.ASC, ".trc": readers.TRC}  # of texts whose first lines may not show the format
 
 
-def _frames_of(path: Path, data: DataFile, zone: tzinfo = UTC) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
+def _frames_of(path: Path, data: DataFile, dates: LocalDates) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
     """The frames of a log, by first line or suffix; raise ConfigurationError, with the format, for another one."""
     suffix, head = suffix_of(path), head_of(path)
     if suffix == ".mf4":
@@ -383,7 +381,7 @@ def _frames_of(path: Path, data: DataFile, zone: tzinfo = UTC) -> "TextFrames | 
         cause = f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
         raise ConfigurationError(cause)
     text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
-    return TextFrames(path, TEXT_FORMATS[name], text, zone)
+    return TextFrames(path, TEXT_FORMATS[name], text, dates)
 
 
 class _NumberedLines:
@@ -423,8 +421,8 @@ class TextFrames:
     place = "line"
     notes: tuple[str, ...] = ()
 
-    def __init__(self, path: Path, kind: TextFormat, text: TextIO, zone: tzinfo) -> None:
-        self._path, self._kind, self._zone = path, kind, zone
+    def __init__(self, path: Path, kind: TextFormat, text: TextIO, dates: LocalDates) -> None:
+        self._path, self._kind, self._dates = path, kind, dates
         self._lines = _NumberedLines(text)
         self._taken = 0
 
@@ -438,7 +436,7 @@ class TextFrames:
         lines = self._lines
         reader = self._kind.reader(lines)
         if isinstance(reader, CandumpLines):
-            reader.zone = self._zone
+            reader.dates = self._dates
         while True:
             try:
                 for frame in reader:

@@ -1,7 +1,9 @@
 """The times of a table: named for each signal, in any unit and form, and questioned where they are improbable."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.table.options import TableSource
 from otolith_drivers.replay.table.reader import open_log
 from tests.drivers.replay.readings import samples
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 
 BEGIN = 1_714_993_372.0  # 2024-05-06 11:02:52 UTC
 NAMED: dict[str, object] = {"time": "Name"}
@@ -177,6 +179,30 @@ def test_days_of_a_spreadsheet_are_in_the_zone_of_the_plant_whatever_stands_besi
         times = np.concatenate([rows.times for rows in reader.chunks()])
     noon = 1_774_778_400.0  # 2026-03-29 12:00 in Berlin
     assert times.tolist() == pytest.approx([0.0, noon, noon + 21_600.0])
+
+
+@pytest.mark.parametrize("pause", [0, 1500, 2400], ids=["none", "25 min", "40 min"])
+@pytest.mark.parametrize("begin", [-1800, -600, 600], ids=["before", "late", "in the hour"])
+def test_dates_of_the_hour_that_comes_twice_go_on(begin: int, pause: int, tmp_path: Path) -> None:
+    """Summer time ended in Berlin at 01:00 UTC, when it was 02:00 again."""
+    end, zone = datetime(2026, 10, 25, 1, tzinfo=UTC), ZoneInfo("Europe/Berlin")
+    since = [begin - 3600 + 20 * row + pause * (row > 150) for row in range(500)]
+    dates = [(end + timedelta(seconds=seconds)).astimezone(zone) for seconds in since]
+    path = table(tmp_path, "time;x", [f"{date:%d.%m.%Y %H:%M:%S};{row}" for row, date in enumerate(dates)])
+    signals = (Signal(name="x", unit="1", source=TableSource()),)
+    with open_log(path, Setup(signals, tmp_path, 20.0, timezone="Europe/Berlin")) as reader:
+        times = np.concatenate([rows.times for rows in reader.chunks()])
+        assert_says(" ".join(reader.warnings()), "twice", "CEST")
+    assert times.tolist() == [end.timestamp() + seconds for seconds in since]
+
+
+def test_dates_without_a_zone_are_said_to_be_taken_as_utc(tmp_path: Path) -> None:
+    signals = (Signal(name="x", unit="1", source=TableSource()),)
+    for zone, mark, is_said in (("", "", True), ("Europe/Berlin", "", False), ("", "+01:00", False)):
+        path = table(tmp_path, "time;x", [f"2026-01-31 12:00:0{row}{mark};{row}" for row in range(9)])
+        with open_log(path, Setup(signals, tmp_path, 1.0, timezone=zone)) as reader:
+            list(reader.chunks())
+            assert ("UTC" in " ".join(reader.warnings())) is is_said
 
 
 def test_a_fast_table_whose_unit_is_stated_is_not_asked_about(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument
 from otolith.health.text import PARTS, Texts, event_text, note_texts
 from otolith.health.times import clock_in, in_local_time, moment_text
+from otolith_drivers.common.time_zones import comes_twice
 
 DATE = len("2026-01-31 ")  # characters of a time before the time of day
 TIMES = DATE + len("23:59:59")
@@ -35,13 +36,15 @@ def event_table(changes: Iterable[EventDocument], width: int, say: Texts, newest
     """Return a table with begin, state, part, cause and end of each event of ``changes``, by their begin.
 
     The state is the most severe one that the event reached. With ``newest`` only so many rows. Times are local; those
-    of another zone than the first name it.
+    of another zone than the first, or of an hour that comes twice, name it.
     """
     rows = _rows(changes)[-(newest or 0) :]
     words = say.translated
-    zones = {moment_text(row.event.start, row.event.timezone)[TIMES:] for row in rows}
+    times = [(at, row.event.timezone) for row in rows for at in (row.event.start, row.event.end) if at is not None]
+    zones = {moment_text(at, zone)[TIMES:] for at, zone in times}
+    is_told = len(zones) > 1 or any(comes_twice(at, zone) for at, zone in times)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold", width=min(width, MAX_WIDTH))
-    length = TIMES if len(zones) < 2 else TIMES + max(map(len, zones))
+    length = TIMES + max(map(len, zones)) if is_told else TIMES
     titles = [words("since"), say("state"), say("part"), say("cause"), say("is_cleared")]
     since, state, part, reason, cleared = (f"{title[:1].upper()}{title[1:]}" for title in titles)
     table.add_column(since, no_wrap=True, min_width=length)

@@ -67,7 +67,7 @@ def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> R
         units = {name: signals[name].unit for name in names}
         ordinary = {name: signals[name].ordinary for name in names}
         own = {name: sources[name] for name in names}
-        return TableReader(path, units, own, ordinary, TableForm(layout, export, zone_named(setup.timezone)))
+        return TableReader(path, units, own, ordinary, TableForm(layout, export, _zone_of(setup)))
 
     by_time = defaultdict[str, list[str]](list)
     clocks = {source.time.column for source in sources.values() if source.time is not None}
@@ -97,12 +97,16 @@ def first_lines(path: Path) -> list[str]:
         data.close()
 
 
+def _zone_of(setup: Setup) -> tzinfo | None:
+    return zone_named(setup.timezone) if setup.timezone else None
+
+
 class TableForm(NamedTuple):
     """What is known of a table before it is opened."""
 
     layout: TableLayout = TableLayout()
     export: TextExport | None = None
-    zone: tzinfo = UTC  # Of dates that name none
+    zone: tzinfo | None = None  # Of dates that name none
 
 
 PLAIN = TableForm()
@@ -150,13 +154,14 @@ class TableReader(Reader):
             if form.export is None:
                 self._header = read_header(path, self._text, self._wanted, request)
             else:
-                self._header, self._text = form.export.opened(path, self._text, self._wanted, zone)
+                self._header, self._text = form.export.opened(path, self._text, self._wanted, zone or UTC)
             variable = self._variable()
         except BaseException:
             data.close()
             raise
         scale, has_dates = self._header.columns[TIME].scale, self._header.date is not None
         clock = Clock(request or TimeRequest(), scale, zone, has_dates=has_dates)
+        self._dates = clock.dates
         self._chunk = TableChunk(self._header, self.counts, clock, named, variable)
         self.ignored = tuple(name for name, _, _ in self._header.others)
         for name, source in named.items():
@@ -233,8 +238,12 @@ class TableReader(Reader):
         parts = [f"{counted(counts.rows, 'row')} read", counted(counts.bad_rows, "bad row")]
         return [*parts, counted(counts.bad_cells, "bad cell"), f"{counted(counts.blank, 'cell')} blank"]
 
+    def assumptions(self) -> list[str]:
+        """What was assumed of the dates."""
+        return self._dates.warnings()
+
     def warnings(self) -> list[str]:
-        lines, counts = self._cut_off(), self.counts
+        lines, counts = [*self.assumptions(), *self._cut_off()], self.counts
         if counts.short:
             what = f"{counted(counts.short, 'row')} without last cells, the first in line {counts.first_short}"
             lines.append(f"{what}: those cells count as blank")

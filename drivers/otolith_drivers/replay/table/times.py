@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from otolith_drivers.common.message_times import unix_time
+from otolith_drivers.common.time_zones import LocalDates
 from otolith_drivers.errors import shown
 from otolith_drivers.replay.readers import Array, Integers
 from otolith_drivers.units import factor
@@ -61,12 +61,12 @@ class TimeRequest(NamedTuple):
 class Clock:
     """The cells of a column of times as Unix times, or seconds from any start. Cells must come in their order."""
 
-    def __init__(self, request: TimeRequest, scale: float, zone: tzinfo, *, has_dates: bool = False) -> None:
+    def __init__(self, request: TimeRequest, scale: float, zone: tzinfo | None, *, has_dates: bool = False) -> None:
         """``scale`` is the unit of numbers, s; ``zone`` that of dates that name none, unless the request does.
 
         ``has_dates`` says that dates stand in front of the times of the day.
         """
-        self._request, self._scale, self._zone = request, scale, request.zone or zone
+        self._request, self._scale, self.dates = request, scale, LocalDates(request.zone or zone)
         self._has_days: bool | None = False if has_dates else None  # whether times of the day stand alone: the first
         self._midnights, self._latest = 0, -math.inf  # of times of the day
 
@@ -93,7 +93,7 @@ class Clock:
                 return False
             if CLOCK_TIME.fullmatch(cell):
                 return True
-            if math.isfinite(date_of(cell, UTC)):
+            if math.isfinite(date_of(cell, LocalDates())):
                 return False
         return False if len(first) else None
 
@@ -101,10 +101,10 @@ class Clock:
         """Return ``times`` (n,), s, from the start that the request or a spreadsheet has."""
         epoch = self._request.epoch
         if epoch is None:
-            return since_1970(times, self._scale, self._zone)
+            return since_1970(times, self._scale, self.dates)
         if epoch.tzinfo is not None:
             return times + epoch.timestamp()
-        return on_wall_clock(times + epoch.replace(tzinfo=UTC).timestamp(), self._zone)
+        return on_wall_clock(times + epoch.replace(tzinfo=UTC).timestamp(), self.dates)
 
     def _of_text(self, text: str) -> float:
         if self._request.format is not None:
@@ -115,7 +115,7 @@ class Clock:
             hours, minutes, seconds = map(int, parts.groups()[:3])
             fraction = float(f"0.{parts[4]}") if parts[4] else 0.0
             return self._after_midnights(HOUR * hours + 60.0 * minutes + seconds + fraction, DAY)
-        return date_of(text, self._zone)
+        return date_of(text, self.dates)
 
     def _formatted(self, text: str, form: str) -> float:
         """Return the time of a date in the stated format, in which the fraction of a second may be absent."""
@@ -125,7 +125,7 @@ class Clock:
         with contextlib.suppress(ValueError, OverflowError):
             moment = datetime.strptime(FRACTION.sub(lambda part: f".{part[1][:6]}", text), form)  # noqa: DTZ007 - in no zone
             if moment.year > NO_YEAR:
-                return unix_time(moment, self._zone) + fraction
+                return self.dates.seconds(moment) + fraction
             since = (moment.replace(tzinfo=UTC) - datetime(NO_YEAR, 1, 1, tzinfo=UTC)).total_seconds() + fraction
             return self._after_midnights(since, DAY if re.search("%[HI]", form) else HOUR)
         return math.inf
@@ -162,13 +162,19 @@ class Clock:
         return f"{shown(text)} may have {what}: write time = {{ {keys}{either} }} for each signal"
 
 
-def on_wall_clock(local: Array, zone: tzinfo) -> Array:
-    """Return the Unix times of ``local`` (n,), s since 1970 on the clocks of ``zone``."""
+def on_wall_clock(local: Array, dates: LocalDates) -> Array:
+    """Return the Unix times of the next ``dates`` (n,), s since 1970 on the clocks of their zone."""
     quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
     begin = datetime(1970, 1, 1, tzinfo=UTC)
     moments = (begin + timedelta(seconds=QUARTER * float(quarter)) for quarter in quarters)
-    offsets = [moment.replace(tzinfo=zone).utcoffset() or timedelta() for moment in moments]
-    return np.asarray(local - np.array([offset.total_seconds() for offset in offsets])[place])
+    offsets = np.array([dates.offsets(moment) for moment in moments]).reshape(-1, 2)[place]
+    first, second = local - offsets[:, 0], local - offsets[:, 1]
+    for row in np.flatnonzero(second > first).tolist():
+        before = dates.last if row == 0 else float(first[row - 1])
+        first[row] = dates.chosen(float(first[row]), float(second[row]), before)
+    dates.assumed(len(local))
+    dates.last = float(first[-1]) if len(local) else dates.last
+    return np.asarray(first)
 
 
 def date_column(names: Sequence[str], rows: Sequence[Sequence[str]], time: int) -> int | None:
@@ -186,24 +192,24 @@ def with_dates(dates: pa.StringArray, times: pa.StringArray) -> pa.StringArray:
     return pc.binary_join_element_wise(pc.utf8_trim_whitespace(dates), pc.utf8_trim_whitespace(times), " ")
 
 
-def date_of(text: str, zone: tzinfo) -> float:
-    """Return the Unix time (s) of a date, in ``zone`` if it names none; infinity for another text."""
+def date_of(text: str, dates: LocalDates) -> float:
+    """Return the Unix time (s) of the next of the ``dates``; infinity for another text."""
     with contextlib.suppress(ValueError):
-        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")), zone)
+        return dates.seconds(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")))
     return math.inf
 
 
-def since_1970(times: Array, scale: float, zone: tzinfo) -> Array:
+def since_1970(times: Array, scale: float, dates: LocalDates) -> Array:
     """Return ``times`` (n,) in s with those of a spreadsheet, in a unit of ``scale`` s, counted from 1970.
 
-    A spreadsheet shows the time of a day in the ``zone`` of the plant.
+    A spreadsheet shows the time of a day in the zone of the plant, as the ``dates`` are.
     """
     if scale != DAY:
         return times
     low, high = (DAY * days for days in SPREADSHEET_DAYS)
     counted = np.flatnonzero((times >= low) & (times <= high))
     moved = times.copy()
-    moved[counted] = on_wall_clock(times[counted] - DAY * DAYS_TO_1970, zone)
+    moved[counted] = on_wall_clock(times[counted] - DAY * DAYS_TO_1970, dates)
     return moved
 
 
@@ -231,7 +237,8 @@ def contradiction(name: str, times: Sequence[float], other: str, cells: Sequence
     """Return what is asked where ``cells`` of column ``other`` are dates that contradict ``times``, s; else empty."""
     if not all(map(TIME_IN_DATE.search, cells)):  # a day, or a number of a batch
         return ""
-    dates = [date_of(cell, UTC) for cell in cells]
+    in_utc = LocalDates(UTC)
+    dates = [date_of(cell, in_utc) for cell in cells]
     if len(set(dates)) < 2 or not all(map(math.isfinite, (*dates, *times))):
         return ""
     by_date, by_time = dates[-1] - dates[0], times[-1] - times[0]

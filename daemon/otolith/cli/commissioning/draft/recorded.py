@@ -32,7 +32,7 @@ def table_offers(path: Path, folder: Path) -> OfferedSource:
             rows += len(chunk.times)
             if rows >= MAX_ROWS:
                 break
-        warnings = reader.warnings()
+        assumptions, warnings = reader.assumptions(), reader.warnings()
     clock = np.concatenate(times)
     offers = []
     for column in columns:
@@ -48,7 +48,7 @@ def table_offers(path: Path, folder: Path) -> OfferedSource:
         raise ConfigurationError(f"{path}: no column has numbers")
     duration = float(np.ptp(clock))
     left = [column.name for column in columns if column.name not in {offer.name for offer in offers}]
-    remarks = [f"no numbers in column {name}" for name in left] + (warnings if not left else [])
+    remarks = [f"no numbers in column {name}" for name in left] + (assumptions if left else warnings)
     driver = ("[driver]", 'type = "replay"', f"file = {toml_value(seen_from(path, folder))}")
     title = f"{path}: {counted(rows, 'row')} in {duration:.6g} s"
     return OfferedSource(title, driver, offers, duration, check=str(path), remarks=remarks)
