@@ -218,7 +218,7 @@ def test_too_much_jitter_makes_a_bad_window() -> None:
     quality = quality_of(series, replace(LIMITS, jitter=0.002))
     assert quality.jitter == pytest.approx(np.sqrt(np.mean(late**2)))
     assert quality.verdict is Verdict.BAD
-    assert "s of jitter, more than jitter_limit (0.002 s)" in quality.reasons[0]
+    assert "ms of jitter, more than jitter_limit (2 ms)" in quality.reasons[0]
 
 
 @pytest.mark.parametrize("surplus", [1, 20, 21, 22, 190])

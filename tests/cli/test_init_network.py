@@ -70,6 +70,15 @@ def test_a_sample_period_that_nothing_shows_is_said_to_be_assumed() -> None:
     assert period_reason([still, moving], "known") == "known"
 
 
+@pytest.mark.parametrize(
+    ("measured", "period"),
+    [(9.99e-3, 0.01), (20.04e-3, 0.02), (1.998e-3, 0.002), (16.67e-3, 0.0167), (33.3e-3, 0.0333), (12.5e-3, 0.0125)],
+)
+def test_an_interval_that_was_measured_is_the_round_one_that_devices_have(measured: float, period: float) -> None:
+    """The end of a window wanders against the samples if its period is a little wrong."""
+    assert proposed_period([Offer("n", "rpm", {}, np.array([1.0, 2.0]), measured)]) == period
+
+
 def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tmp_path: Path) -> None:
     file, target = tmp_path / "drive.toml", f"127.0.0.1:{drive}"
     told = ["--signal", "V_a=10", "--signal", "i=11", "--signal", "omega=12", "--unit", "10=V", "--unit", "11=mA",

@@ -76,7 +76,11 @@ def assess_quality(
             "{1:.0%} of the samples of {0} share a time but differ: log finer times, and one machine in a file; "
             "or raise same_time_limit ({2:.0%})",
         ),
-        *_beyond(jitters, limits.jitter, "{0} arrives with {1:.4g} s of jitter, more than jitter_limit ({2:.4g} s)"),
+        *_beyond(
+            {name: 1e3 * jitter for name, jitter in jitters.items()},
+            1e3 * limits.jitter,
+            "{0} arrives with {1:.3g} ms of jitter, more than jitter_limit ({2:.3g} ms)",
+        ),
     ]
     return Quality(
         verdict=Verdict.BAD if reasons else Verdict.GOOD,

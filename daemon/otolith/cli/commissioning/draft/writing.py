@@ -15,6 +15,7 @@ from otolith_drivers.units import factor
 RECORDS = 200  # of a proposed window
 MIN_LENGTH, MAX_LENGTH = 0.5, 600.0  # s
 WINDOWS = 3  # of a recording at least
+CLOSE_PERIOD = 0.005  # by which a measured interval differs from a round one at most; see thresholds-cli.md
 USUAL_PERIOD = 0.01  # s, where the source shows none
 
 
@@ -50,9 +51,14 @@ def meaning_of(twin: Definition, name: str) -> str:
 
 
 def proposed_period(offers: Sequence[Offer]) -> float:
-    """Return the interval of the fastest of the ``offers`` in s, with three digits and within what a file may have."""
-    fastest = min((offer.interval for offer in offers if offer.interval), default=USUAL_PERIOD)
-    return float(f"{min(max(fastest, 1e-4), 10.0):.3g}")
+    """Return the interval of the fastest of the ``offers`` in s, with three digits and within what a file may have.
+
+    It is a measured one: devices send at a round one, of two digits, if that is so close.
+    """
+    measured = min((offer.interval for offer in offers if offer.interval), default=USUAL_PERIOD)
+    fastest = min(max(measured, 1e-4), 10.0)
+    usual = float(f"{fastest:.2g}")
+    return usual if abs(usual / fastest - 1.0) <= CLOSE_PERIOD else float(f"{fastest:.3g}")
 
 
 def period_reason(offers: Sequence[Offer], known: str) -> str:
@@ -99,6 +105,7 @@ def _head(draft: MachineDraft) -> Iterator[str]:
     yield "[machine]"
     yield f"name = {toml_value(draft.name)}"
     yield f"site = {toml_value(draft.site)}" if draft.site else '# site = "site"'
+    yield '# timezone = "Europe/Berlin"  # of the plant: people read times in it; UTC for dates that name none'
     yield ""
     yield "## Source of the signals. The driver only listens or reads."
     yield from draft.driver
