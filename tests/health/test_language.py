@@ -167,7 +167,7 @@ def test_a_german_machine_has_german_events_and_states() -> None:
     assert event_text(events["winding"]).startswith("HANDELN: Wicklung: Windungsschluss in der Wicklung seit t = ")
     assert "Ankerwiderstand R_a ist 5." in events["winding"].text
     assert "unter dem Grenzwert 6.175 Ω" in events["winding"].text
-    assert events["shaft"].text.startswith("neu: Drehmoment auf der Welle ")
+    assert events["shaft"].text.startswith("neu: Drehmoment auf der Welle, ")
     assert last.health.parts["shaft"].reason == "Unwucht der Welle"
     assert last.health.parts["shaft"].state is Level.ACT  # what programs read is the same in all languages
 

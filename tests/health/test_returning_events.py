@@ -52,7 +52,7 @@ def test_changes_that_are_gone_before_they_are_an_event_of_their_own_are_one_tog
     assert event.condition == "a fault that comes and goes"
     assert event.start == LENGTH * first
     assert event.text.startswith(f"{MIN_RETURNS} times in ")
-    assert event.text.endswith("R_a or V_a")
+    assert event.formulas.endswith("R_a or V_a")
 
 
 @pytest.mark.parametrize("between", ["missed", "bad"])

@@ -487,7 +487,7 @@ def _description(
     texts |= {"language": plan.language, **diagnose(plan.rules, observed.features, plan.texts)}
     texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
     numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
-    texts["setting"] = observed.setting
+    texts |= {"setting": observed.setting, "formulas": observed.formulas}
     evidence = event.evidence.model_copy(update=numbers)
     return {**texts, "timezone": plan.timezone or None, "text": observed.text, "evidence": evidence}
 

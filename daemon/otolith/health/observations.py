@@ -73,6 +73,7 @@ class Observation:
     since: float | None = None  # Service time, s; None for the first window that shows it
     numbers: Mapping[str, float | str] | None = None  # For the evidence of the event
     persistence: Persistence = Persistence()
+    formulas: str = ""  # See EventDocument.formulas
 
     @property
     def limit(self) -> float | None:
@@ -117,7 +118,11 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
-            observations.append(_of_finding(plan, report.twin, finding, before, past))
+            observed = _of_finding(plan, report.twin, finding, before, past)
+            if finding.kind is FindingKind.CLASS:
+                words = plan.texts("class_in_words", count=max(len(report.explanations), 2))
+                observed = replace(observed, text=words, formulas=observed.text)
+            observations.append(observed)
     return [_of_example(plan, item, report.window.start, past) for item in observations]
 
 
@@ -168,8 +173,10 @@ def _of_returns(
         return Observation(key, MACHINE, None if doubtful else Level.OK, features, persistence=once)
     seconds = (report.window.end - report.window.start) * (doubtful[-1] - begins[0] + 1)
     causes = next((item.text for item in report.findings if item.kind is not FindingKind.COMPONENT), "")
-    text = plan.texts("returns", count=len(begins), duration=duration_text(seconds), causes=causes)
-    return Observation(key, MACHINE, Level.WATCH, features, text, since=report.window.end - seconds, persistence=once)
+    text = plan.texts("returns", count=len(begins), duration=duration_text(seconds))
+    since, formulas = report.window.end - seconds, plan.texts("causes_at_last", causes=causes) if causes else ""
+    shown = Observation(key, MACHINE, Level.WATCH, features, text, since=since, persistence=once)
+    return replace(shown, formulas=formulas)
 
 
 def _of_finding(
@@ -346,8 +353,8 @@ def _of_component(
     elif size > QUANTILE * amplitude.sd and not is_expected:
         level = severity(plan.rules, features)
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-    what = {"what": component.meaning, "equation": equation_text(component.equation), "value": interval}
     beside = f", {_beside(limit, size, amplitude.unit, plan.texts)}" if limit else ""
-    text = plan.texts("component", **what, beside=beside)
-    numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
-    return Observation(key, quantity.part, level, features, text, since=component.onset, numbers=numbers)
+    text = plan.texts("component", what=component.meaning, value=interval, beside=beside)
+    numbers, formula = _numbers(size, amplitude.sd, amplitude.unit, limit), equation_text(component.equation)
+    shown = Observation(key, quantity.part, level, features, text, since=component.onset, numbers=numbers)
+    return replace(shown, formulas=formula)

@@ -167,6 +167,7 @@ class EventDocument(DocumentModel):
     cause: str = ""
     advice: str = ""
     setting: str = ""  # What to write into the machine file if it is wrong and the machine is not; for the specialist
+    formulas: str = ""  # Equations of components and causes, which ``text`` has in words; for the specialist
     source: str = ""
     reason: str | None = None  # Why it is cleared although nothing shows that it is over: its learned state was dropped
     language: Language = "en"  # Of condition, text, cause, advice and reason

@@ -182,7 +182,7 @@ def _event_sentence(event: EventDocument, when: Clock, *, details: bool) -> str:
         line = texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
         return f"{line}; {texts('dropped', reason=event.reason)}{notes}" if event.reason else f"{line}{notes}"
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
-    more = (event.setting, explain_command(event)) if details else ()
+    more = (event.formulas, event.setting, explain_command(event)) if details else ()
     advice = "".join(f"; {text}" for text in (event.advice, *more) if text)
     state, since = texts.translated(event.state), when(event.since)
     values = {"state": state, "part": part, "condition": condition, "since": since, "text": event.text}

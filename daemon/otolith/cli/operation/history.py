@@ -6,7 +6,9 @@ import re
 import sys
 import time
 import webbrowser
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -56,11 +58,14 @@ class Since:
 
 def age_or_date(_: click.Context, __: click.Parameter, text: str) -> Since:
     """Return what ``text`` means: an age like ``30d``, or a date and time of the machine's zone."""
+    from otolith_drivers.errors import ConfigurationError
+
     if match := re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip()):
         return Since(age=float(match[1]) * SPANS[match[2]])
     try:
         since = Since(datetime.fromisoformat(text))
-        since.before(0.0, None)
+        with suppress(ConfigurationError):  # in the zone of the machine it may be another
+            since.before(0.0, None)
     except (ValueError, OverflowError) as error:
         raise click.BadParameter(f"{text!r}: write an age like 12h, 30d or 8w, or a date like 2026-01-31") from error
     return since
@@ -244,7 +249,8 @@ def _print_table(
     begin = moment_text(max(first, since), zone)
     console.print(say("history_of", machine=reader.machine, site=reader.site, time=begin, values=values))
     if samples:
-        console.print(Localised(_table(samples, console.width, say), say.decimals))
+        titles = _titles({sample.name for sample in samples}, reader.description().get("places", {}), say)
+        console.print(Localised(_table(samples, titles, console.width, say), say.decimals))
     findings = reader.findings(since) if has_findings else []
     if details:
         print_changes(console, events, _bundles(reader, since), say)
@@ -271,13 +277,26 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
     return {number: bundles[stamp] for number, stamp in stamps.items() if stamp in bundles}
 
 
-def _table(samples: "Sequence[HistorySample]", width: int, texts: "Texts") -> "RenderableType":
+def _titles(names: "Collection[str]", places: "Mapping[str, str]", texts: "Texts") -> dict[str, str]:
+    """Return the titles of rows: parameters by their names, components by place and family if no other has these."""
+    titles = {name: name for name in names}
+    for name in names:
+        place, _, rest = name.partition("/")
+        if rest and place in places:
+            titles[name] = f"{texts.translated(places[place])}, {texts.translated(rest.partition('/')[0])}"
+    counts = Counter(titles.values())
+    return {name: title if counts[title] == 1 else name for name, title in titles.items()}
+
+
+def _table(
+    samples: "Sequence[HistorySample]", titles: "Mapping[str, str]", width: int, texts: "Texts"
+) -> "RenderableType":
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
     from otolith_drivers.units import scale_of
 
     has_range = width >= WIDTH_WITH_RANGE
-    words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
+    words = max(map(len, titles.values())) + max(len(sample.unit) for sample in samples)
     length = max(width - OTHER_COLUMNS - RANGE_COLUMNS * has_range - words, MIN_CURVE)
     table = parameter_table(*(("min", "max") if has_range else ()), "history", width=width, texts=texts)
     first, last = samples[0].time, samples[-1].time
@@ -295,7 +314,7 @@ def _table(samples: "Sequence[HistorySample]", width: int, texts: "Texts") -> "R
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
         scale = scale_of(end.last, unit, reach)
         limits = (scale.number(low), scale.number(high)) if has_range else ()
-        table.add_row(name, *scale.numbers(end.last, reach), scale.unit, change, *limits, curve)
+        table.add_row(titles[name], *scale.numbers(end.last, reach), scale.unit, change, *limits, curve)
     return table
 
 
@@ -321,16 +340,19 @@ def report(machine: str, since: Since, output: Path | None, opens: bool) -> None
     """
     if opens and output == Path("-"):
         raise click.UsageError("--open needs a file: give another --output than '-'")
+    from otolith_drivers.common.time_zones import local_moment
+
     reader, now = reader_of(machine), time.time()
     end = end_of(reader)
-    begin = since.before(end, reader.language_and_zone()[1])
+    zone = reader.language_and_zone()[1]
+    begin = since.before(end, zone)
     if begin >= now:
         raise click.BadParameter("lies in the future", param_hint="'--since'")
     content = page_of(reader, begin, end)
     if output == Path("-"):
         sys.stdout.buffer.write(content)
         return
-    path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
+    path = output or Path(f"{reader.machine}-{local_moment(now, zone):%FT%H%M%S}.html")
     write_page(path, content)
     echo(path)
     if opens and not webbrowser.open(path.absolute().as_uri()):

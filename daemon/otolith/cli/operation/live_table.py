@@ -224,7 +224,8 @@ def state_lines(document: ReportDocument, *, details: bool = False) -> list[Text
         lines += [Text(note, style="magenta") for note in note_texts(event, when)]
         lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
         lines += [Text(command, style="dim")] if (command := explain_command(event)) else []
-        lines += [Text(event.setting, style=HINT_STYLE)] if event.setting and details else []
+        specialist = (event.formulas, event.setting) if details else ()
+        lines += [Text(text, style=HINT_STYLE) for text in specialist if text]
     if undecided := undecided_text(document):
         advice = undecided_advice(document)
         lines.append(Text(undecided, style="bold magenta"))
