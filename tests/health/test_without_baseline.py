@@ -7,7 +7,7 @@ import pytest
 
 from otolith.cli.commissioning.check import lines_without_limits
 from otolith.cli.commissioning.commission import written_value
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import KNOWN_WINDOWS, HealthState, assess
 from otolith.health.limits import Level

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.observations import UNDECIDED
 from otolith.health.schema import FindingKind, Language
 from otolith.health.text import event_text
