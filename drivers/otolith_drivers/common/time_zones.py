@@ -33,6 +33,11 @@ def zone_named(name: str) -> tzinfo:
     return ZoneInfo(name) if name else UTC
 
 
+def stated_zone(name: str) -> tzinfo | None:
+    """Return the time zone of a checked name; None for none."""
+    return zone_named(name) if name else None
+
+
 def local_moment(seconds: float, zone: str | None = None) -> datetime:
     """Return a Unix time in a zone; in that of this computer without one, or if it does not know the zone.
 

@@ -26,7 +26,7 @@ from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.database import EXTENDED_LIMIT
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CLASSIC_LENGTH
-from otolith_drivers.common.time_zones import LocalDates, zone_named
+from otolith_drivers.common.time_zones import LocalDates, stated_zone
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.replay import readers
 from otolith_drivers.replay.mf4 import Mf4Frames
@@ -205,7 +205,7 @@ class CanLogReader(Reader):
         data = DataFile(path)
         super().__init__(path, data)
         try:
-            self._dates = LocalDates(zone_named(zone) if zone else None)
+            self._dates = LocalDates(stated_zone(zone))
             self._source = _frames_of(path, data, self._dates)
         except BaseException:
             data.close()

@@ -6,7 +6,7 @@ The names of its columns are the header of a table, so the times are found, and 
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from datetime import UTC, tzinfo
+from datetime import tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
-from otolith_drivers.common.time_zones import zone_named
+from otolith_drivers.common.time_zones import stated_zone
 from otolith_drivers.config_files import Range
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
@@ -55,7 +55,7 @@ def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> R
 
     def open_columns(names: Sequence[str]) -> ArrayReader:
         units = {name: (signals[name].unit, signals[name].ordinary) for name in names}
-        return ArrayReader(path, units, {name: sources[name] for name in names}, zone_named(setup.timezone))
+        return ArrayReader(path, units, {name: sources[name] for name in names}, stated_zone(setup.timezone))
 
     if len(by_clock) < 2:
         return open_columns(list(signals))
@@ -107,7 +107,7 @@ class ArrayReader(Reader):
         path: Path,
         units: Mapping[str, tuple[str, Range | None]],
         sources: Mapping[str, TableSource],
-        zone: tzinfo = UTC,
+        zone: tzinfo | None = None,
     ) -> None:
         """``units`` has the unit of each signal, and the range of an input in ordinary operation."""
         super().__init__(path)
@@ -226,7 +226,7 @@ class ArrayReader(Reader):
             times: Array = np.full(len(cells), np.nan)
             times[known] = np.asarray(cells)[known].astype("datetime64[us]").astype(np.float64) * 1e-6
             if not (isinstance(cells, Moments) and cells.has_zone):
-                times[known] = on_wall_clock(times[known], self._zone)
+                times[known] = on_wall_clock(times[known], self._clock.dates)
             return times
         if cells.dtype == object:
             texts = pa.array([str(cell) for cell in cells], pa.string())
@@ -250,6 +250,7 @@ class ArrayReader(Reader):
 
     def warnings(self) -> list[str]:
         lines = [] if (coarse := self._times.text()) is None else [coarse]
+        lines += self._clock.dates.warnings()
         if self._bad:
             lines.append(f"bad rows: {self._bad} have no time")
         for name, no_readings in self._no_readings.items():

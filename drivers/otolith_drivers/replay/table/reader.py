@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
-from otolith_drivers.common.time_zones import zone_named
+from otolith_drivers.common.time_zones import stated_zone
 from otolith_drivers.config_files import Range
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
@@ -67,7 +67,7 @@ def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> R
         units = {name: signals[name].unit for name in names}
         ordinary = {name: signals[name].ordinary for name in names}
         own = {name: sources[name] for name in names}
-        return TableReader(path, units, own, ordinary, TableForm(layout, export, _zone_of(setup)))
+        return TableReader(path, units, own, ordinary, TableForm(layout, export, stated_zone(setup.timezone)))
 
     by_time = defaultdict[str, list[str]](list)
     clocks = {source.time.column for source in sources.values() if source.time is not None}
@@ -95,10 +95,6 @@ def first_lines(path: Path) -> list[str]:
         return [text.readline(MAX_LINE) for _ in range(MAX_PREAMBLE)]
     finally:
         data.close()
-
-
-def _zone_of(setup: Setup) -> tzinfo | None:
-    return zone_named(setup.timezone) if setup.timezone else None
 
 
 class TableForm(NamedTuple):
