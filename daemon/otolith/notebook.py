@@ -142,12 +142,12 @@ class Twin:
     def parameters(self) -> tuple[ParameterRow, ...]:
         """All parameters of the twin, in the order of its file, then those of components."""
         problem, prior = self.posterior.problem, self.posterior.prior()
-        known, count = dict(problem.known), len(problem.free)
+        known, count = dict(problem.known) | what_if.supposed_values(self.posterior), len(problem.free)
         free = {item.name: index for index, item in enumerate(problem.free)}
         rows = []
         for item in (*problem.base_model.parameters, *(item for item in problem.free if item.name.startswith("_"))):
             index = free.get(item.name)
-            if index is None:
+            if item.name in known or index is None:
                 value = known[item.name]
                 rows.append(ParameterRow(item.name, value, 0.0, value, value, item.unit, 0.0, False, item.meaning))
                 continue
@@ -155,7 +155,7 @@ class Twin:
             trend, reach = 3600.0 * float(prior.mean[count + index]), QUANTILE * sd
             name = item.label if item.name.startswith("_") else item.name
             ends = value - reach, value + reach
-            rows.append(ParameterRow(name, value, sd, *ends, item.unit, trend, sd > 0.0, item.meaning))
+            rows.append(ParameterRow(name, value, sd, *ends, item.unit, trend, True, item.meaning))
         return tuple(rows)
 
     @property
@@ -344,11 +344,9 @@ class Twin:
         for key in [item.key for item in before.components if item.key not in kept]:
             if key in {item.key for item in posterior.problem.components}:
                 posterior = what_if.without_component(posterior, key)
-        prior, known = own.prior(), dict(before.known)
+        known = dict(before.known)
         values = {name: value for name, value in own.problem.known if known.get(name, value) != value}
-        for index, item in enumerate(own.problem.free):
-            if prior.covariance[index, index] == 0.0:
-                values[item.name] = float(prior.mean[index])
+        values |= what_if.supposed_values(own)
         for name, value in values.items():
             posterior = what_if.with_value(posterior, name, value)
         return posterior

@@ -158,6 +158,8 @@ class _Plot:
         lowest, highest = np.minimum.reduceat(low, self.begins), np.maximum.reduceat(high, self.begins)
         return self._points(np.append(self.x, self.x[::-1]), np.append(highest, lowest[::-1]))
 
-    def _points(self, x: Array, values: Array) -> str:
+    def _points(self, x: Array, values: Array) -> Markup:
+        """Return points; they are no text of a language, whose decimal sign may be another."""
         y = 100.0 * (self.high - values) / (self.high - self.low)
-        return " ".join(f"{across:.2f},{down:.2f}" for across, down in zip(x.tolist(), y.tolist(), strict=True))
+        pairs = zip(x.tolist(), y.tolist(), strict=True)
+        return Markup(" ").join(Markup("{},{}").format(f"{across:.2f}", f"{down:.2f}") for across, down in pairs)

@@ -11,6 +11,7 @@ from otolith.acquisition.window import Array
 from otolith.estimation.imm_filter import TREND_NOISE, process_model
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import indices
+from otolith.simulation.what_if import supposed_values
 
 PAIRS = 200  # Of draws: the ends of a band are exact to 5 % of its width. docs/reference/thresholds-simulation.md
 
@@ -50,7 +51,8 @@ class ParameterDraws:
         drawn = (np.tile(belief.mean[mode], (2, 1)) + opposite(deviations)) * size
         noise = np.tile(TREND_NOISE[belief.level[mode]], (2, 1)) * problem.scale
         held = [index for slot in range(len(problem.components)) for index in indices(problem, slot)[1:]]
-        fixed = [index for index in range(free) if not belief.covariance[:, index, index].any()]  # a person has set it
+        supposed = supposed_values(posterior)
+        fixed = [index for index, item in enumerate(problem.free) if item.name in supposed]
         trends = drawn[:, free:]
         trends[:, held + fixed] = noise[:, held + fixed] = 0.0
         values = np.clip(drawn[:, :free], *problem.bounds)

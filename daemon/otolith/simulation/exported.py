@@ -14,6 +14,7 @@ from otolith.estimation.objective import time_offsets
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, equation, indices, site_of, source_of
 from otolith.simulation.initial_state import last_state
+from otolith.simulation.what_if import supposed_values
 from otolith.twin.components import shift_setting
 from otolith.twin.definition import Input, Site
 from otolith.twin.expressions import parse
@@ -124,12 +125,14 @@ class _Export:
 
     def _values(self) -> tuple[ExportedValue, ...]:
         """Return parameters, constants, and the values of components."""
-        problem, prior, known = self._problem, self._posterior.prior(), dict(self._problem.known)
+        problem, prior = self._problem, self._posterior.prior()
+        known = dict(problem.known) | supposed_values(self._posterior)
         free = {item.name: index for index, item in enumerate(problem.free)}
         found = []
         for item in self._base.parameters:
             index = free.get(item.name)
-            value, sd = (known[item.name], 0.0) if index is None else (float(prior.mean[index]), float(prior.sd[index]))
+            is_given = item.name in known or index is None
+            value, sd = (known[item.name], 0.0) if is_given else (float(prior.mean[index]), float(prior.sd[index]))
             found.append(ExportedValue(item.name, value, sd, item.unit, item.meaning))
         found += [ExportedValue(item.name, item.value, 0.0, item.unit, item.meaning) for item in self._base.constants]
         for slot in range(len(problem.components)):

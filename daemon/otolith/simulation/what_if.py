@@ -40,6 +40,16 @@ def with_value(posterior: Posterior, name: str, written: str | float) -> Posteri
     return posterior.reset_value(index, value, 0.0).reset_value(len(free) + index, 0.0, 0.0)
 
 
+def supposed_values(posterior: Posterior) -> dict[str, float]:
+    """Return the free parameters that are known exactly, which only :func:`with_value` does, by name."""
+    problem, belief = posterior.problem, posterior.belief
+    return {
+        item.name: float(belief.mean[0, index] * problem.scale[index])
+        for index, item in enumerate(problem.free)
+        if not belief.covariance[:, index, index].any()
+    }
+
+
 def without_component(posterior: Posterior, key: str) -> Posterior:
     """Return the same without a component, by its key, or by the begin of it that no other has.
 
