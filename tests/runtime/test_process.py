@@ -5,6 +5,7 @@ import signal
 import struct
 import threading
 import time
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -209,4 +210,42 @@ def test_what_is_no_message_ends_nobody(caplog: pytest.LogCaptureFixture) -> Non
     assert child.replies() == []
     assert_each_says(caplog.messages, ("confused", "cannot be read"))
     assert wait(child.waitables, timeout=0.05) == []  # nobody waits in vain for it
+    child.kill()
+
+
+def test_a_child_that_freezes_before_it_reads_its_arguments_delays_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state of a machine may be larger than what a pipe takes before somebody reads it."""
+    resource_tracker.ensure_running()
+    frozen = tmp_path / "frozen"
+    frozen.write_text("#!/bin/sh\nexec sleep 20\n", encoding="ascii")
+    frozen.chmod(0o700)
+    monkeypatch.setattr("multiprocessing.spawn.get_executable", lambda: os.fsencode(frozen))
+    child = ChildProcess("frozen", "tests.runtime.test_process:answer_and_end", room=1)
+    starting = threading.Thread(target=child.start, args=(bytes(1 << 20),), daemon=True)
+    starting.start()
+    starting.join(within(5.0))
+    assert not starting.is_alive()
+    assert child.alive
+    child.kill()
+    assert not child.alive
+
+
+def answer_size(connection: Any, content: bytes) -> None:
+    """Main function of a child that answers the size of its argument."""
+    connection.send(len(content))
+
+
+def test_a_child_gets_arguments_of_any_size() -> None:
+    child = ChildProcess("large", "tests.runtime.test_process:answer_size", room=1)
+    child.start(bytes(1 << 22))
+    replies: list[object] = []
+
+    def has_replied() -> bool:
+        replies.extend(child.replies())
+        return bool(replies)
+
+    wait_for(has_replied)
+    assert replies == [1 << 22]
     child.kill()

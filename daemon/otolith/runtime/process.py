@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import resource_tracker
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from otolith.health.schema import EventDocument
@@ -39,17 +40,20 @@ PRIVATE_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")  # With t
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
-def _run_main(connection: Any, main: str, arguments: Sequence[Any]) -> None:
+def _run_main(connection: Any, main: str) -> None:
     module, function = main.split(":")
     try:
         with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon has died
+            arguments = connection.recv()
             getattr(import_module(module), function)(connection, *arguments)
     except OSError as error:  # of a disk or a file; the process is started again
         sys.exit(f"{multiprocessing.current_process().name}: {error}")
 
 
-def _send_queued(outbox: queue.Queue[Any], connection: multiprocessing.connection.Connection) -> None:
+def _send_queued(arguments: bytes, outbox: queue.Queue[Any], connection: multiprocessing.connection.Connection) -> None:
+    """Send the pickled arguments of a child, which nobody reads before it has started, then what is queued."""
     with connection, contextlib.suppress(OSError, ValueError):
+        connection.send_bytes(arguments)
         connection.send(message := outbox.get())
         while message is not None:
             connection.send(message := outbox.get())
@@ -123,12 +127,11 @@ class ChildProcess:
         ours, theirs = context.Pipe()
         try:
             self._outbox = queue.Queue(self._room)
-            process = context.Process(
-                target=_run_main, args=(theirs, self._main, arguments), name=self.name, daemon=True
-            )
+            process = context.Process(target=_run_main, args=(theirs, self._main), name=self.name, daemon=True)
+            pickled = bytes(ForkingPickler.dumps(tuple(arguments)))
             resource_tracker.ensure_running()  # its start unblocks signals, so it must be running before the block
             # Each thread has its own descriptor: the next pipe gets the number, and the write, of one that is closed.
-            sending = self._outbox, multiprocessing.connection.Connection(os.dup(ours.fileno()))
+            sending = pickled, self._outbox, multiprocessing.connection.Connection(os.dup(ours.fileno()))
             # Child and thread inherit the mask: only the main thread handles a signal to the whole process group.
             unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
