@@ -29,6 +29,7 @@ from tests.health.test_events import report
 from tests.health.test_hints import agreeing
 from tests.messages import assert_says
 
+EXAMPLE = '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n'
 WITHOUT_LOAD_SENSOR = (
     '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n[signals]\nT_load = { unknown = "friction" }\n'
 )
@@ -83,6 +84,22 @@ def test_limits_that_somebody_wrote_count_at_once(tmp_path: Path) -> None:
     values = '[parameters]\nD = { watch = "0.003 N*m*s/rad", act = "0.006 N*m*s/rad" }\n'
     (event,) = shown(machine_of(tmp_path, WITHOUT_LOAD_SENSOR + values).plan, R_a=6.5, D=0.008).events
     assert event.state is Level.ACT
+
+
+@pytest.mark.parametrize(
+    ("written", "is_said"),
+    [
+        ('watch = "0.001 N*m*s/rad"', True),
+        ('watch = "0.003 N*m*s/rad"', True),
+        ('value = "0.002 N*m*s/rad", estimate = true, watch = "0.003 N*m*s/rad"', False),
+        ('watch = ["0.001 N*m*s/rad", "0.003 N*m*s/rad"]', False),
+    ],
+)
+def test_the_side_of_a_limit_that_an_example_decides_is_said(written: str, is_said: bool, tmp_path: Path) -> None:
+    machine = machine_of(tmp_path, f"{EXAMPLE}[parameters]\nD = {{ {written} }}\n")
+    text = machine.plan.parameters["D"].limits_text
+    assert ("side" in text) is is_said
+    assert ("0.00143" in text or "1.43" in text) is is_said
 
 
 @pytest.mark.parametrize(
@@ -186,7 +203,6 @@ def test_what_commissioning_writes_of_motor_and_load_is_judged(tmp_path: Path) -
     assert (event.part, event.state) == ("bearing", Level.ACT)
 
 
-EXAMPLE = '[machine]\nname = "motor"\n[twin]\nname = "dc_motor"\n'
 STATED = "[parameters]\n" + "".join(
     f'{name} = "{value}"\n'
     for name, value in {"L_a": "0.6 H", "J": "12 kg*cm^2", "K_e": "0.04 V*s/rad", "K_t": "0.04 N*m/A"}.items()

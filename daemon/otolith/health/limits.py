@@ -93,6 +93,9 @@ class MonitoredQuantity:
     def limits_text(self) -> str:
         """The limits in words; empty without one."""
         texts = [f"{item.level} {item.side} {quantity_text(item.value, self.unit)}" for item in self.limits]
+        if self.is_example and len(self.limits) == 1:
+            example = f"{quantity_text(self.nominal, self.unit)}, the value of the twin's example"
+            texts.append(f"the side as seen from {example}: write value = ... of your machine beside it")
         shares = [f"{item.level} {item.value / self.nominal - 1.0:+.0%}" for item in self.waiting]
         texts += [f"{', '.join(shares)} of the baseline, none yet: run 'otolith commission'"] if shares else []
         return ", ".join(texts)
