@@ -74,6 +74,7 @@ def test_check_adds_up_the_windows_of_several_files(machine: Path) -> None:
     alone, both = (json.loads(otolith("check", machine, *given, "--json").stdout) for given in (files[:1], files))
     assert (alone["rows"], both["rows"]) == (300, 600)
     assert both["windows"]["count"] == 2 * alone["windows"]["count"] == 2 * both["windows"]["usable"] / 2
+    assert both["steps_back"] == 0  # each file has a clock of its own
     assert both["data"] == ", ".join(map(str, files))
 
 

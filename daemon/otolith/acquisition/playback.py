@@ -369,7 +369,7 @@ class RecordingStatistics:
     def __init__(self, signals: tuple[str, ...]) -> None:
         self.rows = 0
         self.first, self.last = math.inf, -math.inf  # Earliest and latest time, s
-        self.steps_back = 0  # Rows with a time before that of the row above
+        self.steps_back = 0  # Rows with a time before that of the row above, in a recording
         self.first_step_back: tuple[int, float, float] | None = None  # Line, time (s), and time of the row above
         self._signals = {signal: SignalStatistics() for signal in signals}
         self._last_time = -math.inf
@@ -380,7 +380,7 @@ class RecordingStatistics:
             return
         self.rows += len(rows.times)
         before = np.concatenate([[self._last_time], rows.times[:-1]])
-        back = np.flatnonzero(rows.times < before)
+        back = np.flatnonzero((rows.times < before) & ~rows.begins)  # another recording has a clock of its own
         self.steps_back += len(back)
         if len(back) and self.first_step_back is None:
             first = int(back[0])

@@ -49,6 +49,8 @@ def test_a_time_of_the_day_among_dates_is_bad(tmp_path: Path) -> None:
 def test_a_time_that_may_be_two_is_asked_about_and_answered_by_its_format(
     tmp_path: Path, cell: str, forms: tuple[str, str]
 ) -> None:
+    with raises_saying(ConfigurationError, "table.csv:2", 'column = "Zeit"'):
+        samples(written(tmp_path, "Zeit;x", f"{cell};1"), x={})
     path = written(tmp_path, "t;x", f"{cell};1")
     with raises_saying(ConfigurationError, "table.csv:2", cell, *(f'format = "{form}"' for form in forms)):
         samples(path, x={})
@@ -188,10 +190,10 @@ def test_rows_may_lack_their_last_cells(tmp_path: Path) -> None:
 
 def test_a_column_may_end_before_the_others(tmp_path: Path) -> None:
     """The first row without its last cell may be one that is cut; those that follow are not."""
-    rows = [f"{row};{row};{row}" if row < 10 else f"{row};{row}" for row in range(20)]
+    rows = [f"{row};{row};{row}" if row < 150 else f"{row};{row}" for row in range(200)]
     found = samples(written(tmp_path, "t;x;y", *rows), bad=1, x={}, y={})
-    assert [value for _, value in found["x"]] == [row for row in range(20) if row != 10]
-    assert [value for _, value in found["y"]] == [*range(10)]
+    assert [value for _, value in found["x"]] == [row for row in range(200) if row != 150]
+    assert [value for _, value in found["y"]] == [*range(150)]
 
 
 def test_one_row_without_its_last_cell_is_damaged(tmp_path: Path) -> None:

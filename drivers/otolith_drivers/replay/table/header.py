@@ -38,7 +38,8 @@ NAMES_NAME = re.compile(
 VALUE_NAME = re.compile(r"(?:var|tag)?[_ ]?(?:value|wert)|state", re.IGNORECASE)
 WHICH_COLUMNS = 'write table = { names = "...", values = "..." } with the columns of both under [driver]'
 MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
-MIN_RAGGED = 2  # of them without their last cells, from which on all rows may be so; one may be damaged
+MAX_JUDGED = 100  # rows below the header, among which
+MIN_RAGGED = 2  # without their last cells, from which on all may be so; one may be damaged
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none|unavailable|unknown)?$"
@@ -99,6 +100,7 @@ class Header:
     others: tuple[tuple[str, int, str | None], ...] = ()
     """Name, position in a row and unit of the columns that no signal uses; None without a unit in the header."""
     date: int | None = None  # Position of the column of the date in a row, from 0, if that of the time has none
+    clock: str = TIME  # Name of the column of the time
     is_shared: bool = False  # Whether other columns of a row may have times of their own
     is_ragged: bool = False  # Whether rows lack the cells at their end that are blank
     is_unit_stated: bool = True  # Whether that of the time is
@@ -150,8 +152,9 @@ def read_header(
             raise ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
         _, number, cells = max(faults)
         places, others = _places(f"{path}:{-number}", cells, wanted, seen(read.encode()))
-    rows += [line for _ in range(MAX_BELOW - len(rows)) if (line := file.readline(MAX_LINE + 1))]
-    split = [split_quoted(row, sign) for row in rows]
+    rows += [line for _ in range(MAX_JUDGED - len(rows)) if (line := file.readline(MAX_LINE + 1))]
+    judged = [split_quoted(row, sign) for row in rows]
+    split = judged[:MAX_BELOW]
     units, skipped = _units_beside(above, split, wanted, places)
     date = _place_of_date(f"{path}:{number}", clock, others)
     if date is None:
@@ -172,8 +175,9 @@ def read_header(
         below,
         others,
         date,
+        clock=name_and_unit(cells[columns[TIME].place])[0],
         is_shared=time is not None,
-        is_ragged=sum(1 < len(row) < named for row in split[skipped:]) >= MIN_RAGGED,
+        is_ragged=sum(1 < len(row) < named for row in judged[skipped:]) >= MIN_RAGGED,
         is_unit_stated=is_unit_stated or clock.epoch is not None,
         beside=beside,
     )

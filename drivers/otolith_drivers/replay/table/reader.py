@@ -156,7 +156,7 @@ class TableReader(Reader):
             data.close()
             raise
         scale, has_dates = self._header.columns[TIME].scale, self._header.date is not None
-        clock = Clock(request or TimeRequest(), scale, zone, has_dates=has_dates)
+        clock = Clock(request or TimeRequest(self._header.clock), scale, zone, has_dates=has_dates)
         self._dates = clock.dates
         self._chunk = TableChunk(self._header, self.counts, clock, named, variable)
         self.ignored = tuple(name for name, _, _ in self._header.others)
