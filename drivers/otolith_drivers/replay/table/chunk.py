@@ -20,9 +20,8 @@ from otolith_drivers.replay.table.cells import (
 )
 from otolith_drivers.replay.table.header import BLANK, TIME, Header, split_quoted
 from otolith_drivers.replay.table.options import TableSource
-from otolith_drivers.replay.table.times import Clock, with_dates
+from otolith_drivers.replay.table.times import DATE, Clock, with_dates
 
-DATE = "2026-03-29T01:59:58.25Z"  # an example
 NO_ROW = r"^\s*(?:#|EOF\s*$|//END)"  # begin of a comment, and of the mark that exports write at their end
 NO_VARIABLE = frozenset({"", "$RT_OFF$", "$RT_DIS$", "$RT_COUNT$"})  # in the column of names: marks of WinCC
 MAX_NAMES = 50  # of variables that a message lists; engineering choice

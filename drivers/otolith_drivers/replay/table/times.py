@@ -30,6 +30,8 @@ TIME_OF_DAY = re.compile(r"\s*\d{1,2}:\d\d")
 CLOCK_TIME = re.compile(r"\s*(\d{1,3}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?\s*")
 HALF_CLOCK_TIME = re.compile(r"\s*\d{1,3}:[0-5]\d(?:[.,]\d{1,9})?\s*")  # hours and minutes, or minutes and seconds
 FRACTION = re.compile(r"(?<=\d)[.,](\d{1,12})(?=\D*$)")  # of the second
+DATE = "2026-03-29T01:59:58.25Z"  # an example
+MONTHS = 12
 NO_YEAR = 1900  # of a date that has none, for strptime
 # Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
 SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
@@ -151,15 +153,16 @@ class Clock:
             has_half = re.search("[ap]m", text, re.IGNORECASE)
             seconds = ":%S" if text.count(":") > 1 else ""
             clock = f" %I:%M{seconds} %p" if has_half else f" %H:%M{seconds}"
-        forms = (f"%{first}{sign}%{second}{sign}{year}{clock}" for first, second in ("dm", "md"))
-        return self._question(text, "the day or the month first", *forms)
+        months = {f"%d{sign}%m": int(parts[3]), f"%m{sign}%d": int(parts[1])}
+        forms = [f"{order}{sign}{year}{clock}" for order, month in months.items() if month <= MONTHS]
+        return self._question(text, "the day or the month first", *forms) if forms else ""
 
     def _question(self, text: str, what: str, *forms: str) -> str:
         keys = f'column = "{self._request.column}", ' + (
             f'date = "{self._request.date}", ' if self._request.date else ""
         )
         either = " or ".join(f'format = "{form}"' for form in forms)
-        return f"{shown(text)} may have {what}: write time = {{ {keys}{either} }} for each signal"
+        return f"{shown(text)} may have {what}: write time = {{ {keys}{either} }} under [signals], or dates like {DATE}"
 
 
 def on_wall_clock(local: Array, dates: LocalDates) -> Array:
