@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,7 @@ from otolith.health.status import (
     WindowEvidence,
     publish,
     some_parameter_is_determined,
+    without_traded_at_a_bound,
 )
 from otolith.twin.components import SourceKind
 from otolith_drivers.units import equation_text
@@ -196,6 +197,12 @@ def _parameters(
         previous[parameter.label], document = publish(parameter, float(required[index]), marginal, evidence, before)
         if not parameter.name.startswith("_"):
             documents[parameter.name] = document
+    if estimated is not None:
+        documents = without_traded_at_a_bound(documents, estimated.parameters)
+    for parameter in problem.free:
+        if parameter.name in documents:
+            status = documents[parameter.name].status
+            previous[parameter.label] = replace(previous[parameter.label], status=status)
     return previous, documents
 
 

@@ -39,6 +39,7 @@ NEGLIGIBLE_BIAS = 0.02  # standard deviations of a window: a smaller bias is not
 MIN_KEPT_INFORMATION = 0.5  # share of the information of a direction that is not by the noise of inputs; less is noise
 INFORMATION_OF_NOISE = 0.01  # share of the information of a direction that noise has determined: far less than stated
 CORRELATED = 3.0  # standard deviations of sums of autocovariances of white noise: what is smaller is chance
+WIDEN_BOUNDS = "widen the bounds in [parameters], or check the equations of the twin"
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
@@ -91,6 +92,7 @@ class ParameterEstimate:
     sd: float  # Standard deviation; infinite where the window has no information
     identifiability: Identifiability
     reason: str
+    traded_with: tuple[str, ...] = ()  # Other parameters from which the window does not distinguish it
 
 
 def information(jacobian: Array, width: Array, inflation: float) -> Information:
@@ -198,7 +200,13 @@ class AccuracyTarget:
 def at_its_bound(value: float, unit: str) -> str:
     """Return the reason of a parameter at a bound, with the way out."""
     bound = f"{value:.4g} {unit_text(unit)}".rstrip()
-    return f"at its bound {bound}: widen the bounds in [parameters], or check the equations of the twin"
+    return f"at its bound {bound}: {WIDEN_BOUNDS}"
+
+
+def partners(uncertainty: Information, index: int, names: Sequence[str]) -> tuple[str, ...]:
+    """Return which of the parameters ``names`` can be traded with parameter ``index``."""
+    correlations = np.abs(uncertainty.correlation[index, : len(names)])
+    return tuple(name for at, name in enumerate(names) if at != index and correlations[at] > TRADED)
 
 
 def classify(

@@ -28,6 +28,7 @@ from otolith.estimation.information import (
     classify,
     inflation_of,
     information,
+    partners,
     without_input_noise,
 )
 from otolith.estimation.minimisers import MAX_STEPS, FitResult, continued, gauss_newton
@@ -446,7 +447,8 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
         if outcome is Outcome.AMBIGUOUS and identifiability is Identifiability.DETERMINED:
             identifiability, reason = Identifiability.WEAK, outcome.value
         sd = float(both.information.sd[index])
-        estimates.append(ParameterEstimate(parameter.name, value, sd, identifiability, reason))
+        traded_with = partners(both.information, index, [free.name for free in problem.free])
+        estimates.append(ParameterEstimate(parameter.name, value, sd, identifiability, reason, traded_with))
     return tuple(estimates)
 
 

@@ -4,12 +4,18 @@ A source that is down or silent is named in the reason. The connection to the ma
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 from otolith.acquisition.window import Window
 from otolith.discovery.alternatives import ACCEPTED, WindowDecision
-from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate, at_its_bound
+from otolith.estimation.information import (
+    QUANTILE,
+    WIDEN_BOUNDS,
+    Identifiability,
+    ParameterEstimate,
+    at_its_bound,
+)
 from otolith.estimation.window_fit import AT_BOUND
 from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status
 from otolith.twin.definition import Parameter
@@ -104,6 +110,31 @@ def publish(
         identifiability=Identifiability.AT_BOUND if at_bound else identifiability,
         reason=reason or _default_reason(status),
     )
+
+
+def without_traded_at_a_bound(
+    documents: Mapping[str, ParameterDocument], estimates: Iterable[ParameterEstimate]
+) -> dict[str, ParameterDocument]:
+    """Return the documents; what the window trades with a parameter at its bound is invalid.
+
+    What the other parameter lacks beyond its bound is then part of this one, which the interval does not show.
+    """
+    at_bound = {
+        name
+        for name, item in documents.items()
+        if item.status is Status.INVALID and item.identifiability is Identifiability.AT_BOUND
+    }
+    result = dict(documents)
+    for item in estimates:
+        names = ", ".join(name for name in item.traded_with if name in at_bound)
+        is_shown = item.name in result and result[item.name].status in (Status.ESTIMATED, Status.HELD)
+        if names and is_shown and item.identifiability is Identifiability.TRADED:
+            changes = {
+                "status": Status.INVALID,
+                "reason": f"it can be traded with {names} at its bound: {WIDEN_BOUNDS}",
+            }
+            result[item.name] = result[item.name].model_copy(update=changes)
+    return result
 
 
 def _status(
