@@ -54,17 +54,17 @@ enabled = false
 """
 PERIOD, RECORDS, SUBSTEPS, NOISE = 0.01, 500, 20, 0.5
 DRY, BEYOND = 0.0366, 1.6e-4  # N*m; N*m*s/rad, beyond the bounds of B
-TORQUES = {
-    "slow": lambda time: 0.1 + 0.004 * np.sin(0.5 * time),
-    "steps": lambda time: np.where(time % 20.0 < 10.0, 0.1, 0.07),
-}
+
+
+def torques(kind: str, time: Array) -> Array:
+    return np.asarray(0.1 + 0.004 * np.sin(0.5 * time) if kind == "slow" else np.where(time % 20.0 < 10.0, 0.1, 0.07))
 
 
 def servo_record(torque: str, inertia: float, viscous: float, windows: int) -> Array:
     """Torque and speed of a servo, by Euler's method with fine steps."""
-    random, time = np.random.default_rng(1), PERIOD * np.arange(windows * RECORDS)
+    random, time = np.random.default_rng(1), PERIOD * np.arange(windows * RECORDS, dtype=np.float64)
     speed, rows = 0.0, []
-    for drive in np.asarray(TORQUES[torque](time)).tolist():
+    for drive in torques(torque, time).tolist():
         rows.append((drive, speed + NOISE * random.normal()))
         for _ in range(SUBSTEPS):
             speed += PERIOD / SUBSTEPS * (drive - viscous * speed - DRY * np.tanh(speed / 2.0)) / inertia

@@ -67,6 +67,11 @@ DISAGREEMENT = (
 )
 UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
+UNDECIDED_WINDOWS = 4  # in a row, from which on the stated levels may be the cause
+LEVELS_TOO_SMALL = (
+    "{} windows in a row differ from their prediction by more than [noise] and [process_noise] allow: "
+    "if the machine is well, these levels are too small: 'otolith noise' identifies them from a record"
+)
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
 CHANGED = "something has changed"
@@ -237,6 +242,8 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     variance_ratio = result.posterior.belief.variance_ratio
     if variance_ratio > DISAGREEING_RATIO:
         reasons.append(DISAGREEMENT.format(variance_ratio**0.5))
+    if decision is WindowDecision.SUSPECTED and (windows := result.contradictions(state)) >= UNDECIDED_WINDOWS:
+        reasons.append(LEVELS_TOO_SMALL.format(windows))
     if decision is WindowDecision.REFUSED and not some_parameter_is_determined(state.previous):
         reasons.append(NEVER_EXPLAINED)
     return "; ".join(reasons)
