@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.quality import is_of_calendar
-from otolith.acquisition.window import Array, Window
-from otolith.adaptation.adapt import adapt
+from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
@@ -28,6 +27,7 @@ from otolith.simulation import what_if
 from otolith.simulation.export_modelica import modelica_text
 from otolith.simulation.export_python import python_text
 from otolith.simulation.exported import ExportedTwin, exported_twin
+from otolith.simulation.initial_state import after_window
 from otolith.simulation.plan import joined, planned_window
 from otolith.simulation.prediction import Prediction
 from otolith.simulation.simulate import simulate, substeps_of
@@ -318,24 +318,22 @@ class Twin:
     def _after_lead(self, stretch: RecordedStretch) -> tuple[Posterior, Window, float]:
         """Return the posterior after the first usable window of a recording, the rest, and the time of its begin.
 
-        What a person supposes holds in the rest. A recording that is not after what was learned counts as if it were:
-        phases of components are then unknown before the first window.
+        What a person supposes holds in the rest only. A recording that is not after what was learned counts as if it
+        were: phases of components are then unknown before the first window.
         """
-        state, first, end = self.learned, stretch.windows[0], self.posterior.belief.end
+        known, first = self.learned.posterior, stretch.windows[0]
+        end = known.belief.end
         by = -self.labels.ahead(end) if np.isfinite(end) else 0.0
         if np.isfinite(end) and first.start + by < end - 0.5 * first.sample_period:
             by = end + first.grid.length - first.start
         windows = [replace(window, start=window.start + by) for window in stretch.windows]
         for index, window in enumerate(windows[: min(MAX_LEAD, len(windows) - 1)]):
-            state, _ = adapt(state, window)
-            phase = state.posterior.phase
-            if phase is not None and phase.last_state and abs(phase.next_start - window.end) < window.sample_period:
+            if window.quality.verdict is Verdict.GOOD:
                 rest = joined([window.since(window.records - 1), *windows[index + 1 :]])
-                return self._supposed_of(state.posterior), rest, rest.start - by
-        raise ConfigurationError(
-            f"{stretch.path}: the first {MAX_LEAD} windows cannot be used, so the state of the machine is not known: "
-            "'otolith check' shows why"
-        )
+                return self._supposed_of(after_window(known, window)), rest, rest.start - by
+        reasons = [reason for window in windows[:MAX_LEAD] for reason in window.quality.reasons]
+        fault = f"none of the first {MAX_LEAD} windows can be used: {reasons[0]}"
+        raise ConfigurationError(f"{stretch.path}: {fault}: give a span that begins later")
 
     def _supposed_of(self, posterior: Posterior) -> Posterior:
         """Return a later posterior of the same machine with what a person supposes."""

@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -18,10 +19,11 @@ from otolith.adaptation.state import AdaptationState
 from otolith.machine import load_machine
 from otolith.storage.history import history_directory
 from otolith.storage.log_history import log_history
+from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.commands import otolith
 from tests.messages import assert_says, raises_saying
-from tests.simulation.recorded_motor import PLAN, save_learned, write_files
+from tests.simulation.recorded_motor import PLAN, learned, save_learned, write_files
 from tests.storage.histories import document
 
 
@@ -77,6 +79,18 @@ def test_a_recording_is_predicted_after_its_first_window(machine: Path) -> None:
     assert np.sqrt(np.mean(deviates**2, axis=0)) == pytest.approx(1.0, abs=0.3)
     for name in predicted.outputs:
         assert 0.9 < (predicted.coverage(name) or 0.0) <= 1.0
+
+
+def test_a_recording_that_contradicts_what_was_learned_is_predicted_nevertheless(machine: Path) -> None:
+    """As one of a time before the machine has changed: its first window shows the state, and changes no parameter."""
+    state = learned(machine)
+    moved = state.posterior.reset_value(0, 6.0, 0.003)
+    store_of(load_machine(machine, with_driver=False)).save(replace(state, posterior=moved))
+    twin = Twin.load(machine)
+    assert twin.parameters[0].value == pytest.approx(6.0)
+    predicted = twin.simulate(machine.with_name("monday.csv"))
+    assert predicted.records == 401
+    assert (predicted.coverage("omega") or 0.0) < 0.5
 
 
 def test_what_is_supposed_changes_the_prediction(machine: Path) -> None:

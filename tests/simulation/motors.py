@@ -1,4 +1,4 @@
-"""A DC motor whose winding resistance is known to an interval, and plans for it."""
+"""A DC motor whose winding resistance is known to an interval, plans for it, and the twins of the library."""
 
 from dataclasses import replace
 
@@ -38,3 +38,14 @@ def plan(seconds: float, voltage: float = 20.0) -> Window:
     times = np.array([0.0, seconds])
     columns: dict[str, Array] = {"V_a": np.full(2, voltage), "T_load": np.full(2, 0.02)}
     return planned_window(TWIN, times, columns, PERIOD, 0.0)
+
+
+def library_state(name: str) -> Posterior:
+    """A twin of the library with the values of its file."""
+    twin = find_twin(name)
+    first, rest = twin.parameters[0], twin.parameters[1:]
+    noise = tuple(output.noise for output in twin.outputs)
+    known, options = tuple((item.name, item.nominal) for item in rest), WindowOptions(200, 200, 200, PERIOD)
+    own = Problem(twin, known, (first,), noise, window=options)
+    reached = tuple(state.initial for state in twin.states)
+    return replace(Posterior.initial(own), phase=PhaseAdvance(-1.99, PERIOD, (), reached))

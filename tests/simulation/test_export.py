@@ -13,8 +13,8 @@ import pytest
 from otolith.acquisition.window import Array
 from otolith.estimation.objective import input_matrix, time_offsets
 from otolith.estimation.posterior import PhaseAdvance, Posterior
-from otolith.estimation.problem import Component, Problem, WindowOptions, augment
-from otolith.machine import find_twin, library_twins
+from otolith.estimation.problem import Component, augment
+from otolith.machine import library_twins
 from otolith.simulation.export_modelica import identifier, modelica_expression, modelica_text
 from otolith.simulation.export_python import python_text
 from otolith.simulation.exported import exported_twin
@@ -22,7 +22,7 @@ from otolith.simulation.plan import planned_window
 from otolith.simulation.simulate import STEP_RECORDS, substeps_of
 from otolith.twin.expressions import parse
 from otolith.twin.kernel import Excitation, kernel_of
-from tests.simulation.motors import PERIOD, posterior, problem
+from tests.simulation.motors import PERIOD, library_state, posterior, problem
 from tests.variants import often
 
 COMPONENTS = (
@@ -36,17 +36,6 @@ COMPONENTS = (
      Component("winding", "power", "i", 0.1, 1.5, low=0.3, high=4.0),
      Component("sensor of i", "negative exponential", "V_a", 0.1, 0.1, low=0.01, high=1.0)),
 )  # fmt: skip
-
-
-def library_state(name: str) -> Posterior:
-    """A twin of the library with the values of its file."""
-    twin = find_twin(name)
-    first, rest = twin.parameters[0], twin.parameters[1:]
-    noise = tuple(output.noise for output in twin.outputs)
-    known, options = tuple((item.name, item.nominal) for item in rest), WindowOptions(200, 200, 200, PERIOD)
-    own = Problem(twin, known, (first,), noise, window=options)
-    reached = tuple(state.initial for state in twin.states)
-    return replace(Posterior.initial(own), phase=PhaseAdvance(-1.99, PERIOD, (), reached))
 
 
 def completed(components: tuple[Component, ...]) -> Posterior:

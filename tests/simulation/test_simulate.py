@@ -12,13 +12,15 @@ from scipy.stats import norm
 from otolith.acquisition.window import Window
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Component, augment
+from otolith.machine import library_twins
 from otolith.simulation.draws import root_of
 from otolith.simulation.initial_state import last_state, state_covariance
+from otolith.simulation.plan import planned_window
 from otolith.simulation.simulate import simulate
 from otolith.simulation.what_if import with_value, without_component
 from otolith.twin.kernel import Excitation, kernel_of
-from tests.simulation.motors import NOISE, PERIOD, TWIN, plan, posterior, problem
-from tests.variants import often_rows
+from tests.simulation.motors import NOISE, PERIOD, TWIN, library_state, plan, posterior, problem
+from tests.variants import often, often_rows
 
 SENSORS = np.array(list(NOISE.values()))
 
@@ -88,6 +90,20 @@ def test_bands_hold_95_percent_of_what_a_machine_shows(runs: int, records: int, 
         predicted = simulate(posterior(sd, state=(float(off[0]), float(off[1]))), window, seed=run)
         held += [predicted.coverage(name) or 0.0 for name in predicted.outputs]
     assert np.mean(held) == pytest.approx(0.95, abs=tolerance)
+
+
+@pytest.mark.parametrize("name", often([], library_twins()))
+def test_each_twin_of_the_library_is_predicted_with_finite_bands(name: str) -> None:
+    state = library_state(name)
+    first, times = state.problem.free[0], PERIOD * np.arange(200, dtype=np.float64)
+    halves = np.arange(200) // 50 % 2
+    columns = {item.name: np.where(halves, 0.5, 0.1) * item.high for item in state.problem.twin.inputs}
+    window = planned_window(state.problem.twin, times, columns, PERIOD, 0.0)
+    uncertain = state.reset_value(0, first.nominal, 0.02 * abs(first.nominal) + 1e-6)
+    found = simulate(uncertain, window)
+    assert found.diverges is None
+    assert np.isfinite(found.low).all()
+    assert (found.high - found.low >= 2.0 * QUANTILE * 0.999 * np.array(state.problem.noise)).all()
 
 
 def test_process_noise_widens_the_band_as_theory_says() -> None:

@@ -1,9 +1,13 @@
 """The state from which a simulation begins, and how well it is known: that of the last record of the last window."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Window
 from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import indices
+from otolith.estimation.window_fit import fit_predicted
 from otolith.twin.kernel import Kernel
 
 DIFFERENCE = 1e-6  # relative step of the central differences
@@ -20,6 +24,30 @@ def last_state(posterior: Posterior) -> Array:
         raise ValueError("no window has been learned from yet, so the state of the machine is not known")
     added = len(posterior.problem.twin.states) - len(known)
     return np.concatenate([known, np.zeros(added)])
+
+
+def after_window(posterior: Posterior, window: Window) -> Posterior:
+    """Return the posterior with the state, and the phases of components, at the last record of ``window``.
+
+    All other values keep what is known of them, also where the window contradicts it.
+
+    Raises:
+        ValueError: the twin diverges in the window.
+    """
+    predicted, problem = posterior.predict(window), posterior.problem
+    starts = predicted.with_phases(predicted.start())
+    best = min((fit_predicted(predicted, problem, window, start) for start in starts), key=lambda fit: fit.chi_square)
+    advance = best.advance()
+    if not advance.last_state:
+        raise ValueError("the twin diverges")
+    root = best.evidence().sqrt_information
+    covariance = np.linalg.pinv(root.T @ root + np.linalg.pinv(predicted.prior().covariance))
+    for slot, component in enumerate(problem.components):
+        if component.periodic:
+            phase = indices(problem, slot)[-1]
+            sd = float(np.sqrt(max(covariance[phase, phase], 0.0)))
+            predicted = predicted.reset_value(phase, float(best.parameters[phase]), sd)
+    return replace(predicted, phase=advance)
 
 
 def state_covariance(posterior: Posterior, kernel: Kernel, parameters: Array, inputs: Array, substeps: int) -> Array:

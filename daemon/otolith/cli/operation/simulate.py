@@ -118,7 +118,7 @@ def simulate(
     elif csv != Path("-"):
         _print_summary(prediction, twin)
     if prediction.diverges is not None:
-        echo(_divergence(prediction), err=True)
+        echo(_divergence(prediction, twin), err=True)
 
 
 def _check(*, is_adapted: bool, has_moment: bool, prints: int) -> None:
@@ -175,12 +175,10 @@ def _source(twin: "Twin", data: Path | None, span: tuple[str, str] | None) -> "P
     return source
 
 
-def _divergence(prediction: "Prediction") -> str:
-    moment = prediction.start + (prediction.diverges or 0.0)
+def _divergence(prediction: "Prediction", twin: "Twin") -> str:
+    moment = _moment_text(prediction.start + (prediction.diverges or 0.0), twin)
     remedy = "the values of --set, and intervals that contain unstable values, are the likely cause"
-    return (
-        f"from t = {moment:.6g} s on the twin diverges with values that are possible, so nothing is predicted: {remedy}"
-    )
+    return f"from {moment} on the twin diverges with values that are possible, so nothing is predicted: {remedy}"
 
 
 def columns(prediction: "Prediction", twin: "Twin") -> dict[str, Any]:
@@ -261,14 +259,17 @@ def _document(prediction: "Prediction", twin: "Twin") -> dict[str, Any]:
     }
 
 
-def _notes(twin: "Twin") -> list[str]:
-    """Return of which state the prediction is, and what is supposed."""
+def _moment_text(seconds: float, twin: "Twin") -> str:
+    """Return a Unix time in the zone of the machine, or the time of a plan or log without dates."""
     from otolith.acquisition.quality import is_of_calendar
     from otolith.cli.common import local_time
 
-    at = twin.time or 0.0
-    when = local_time(at, twin.machine.plan.timezone) if is_of_calendar(at) else f"t = {at:.6g} s"
-    return [f"learned until {when}", *(f"what if: {line}" for line in twin.supposed)]
+    return local_time(seconds, twin.machine.plan.timezone) if is_of_calendar(seconds) else f"t = {seconds:.6g} s"
+
+
+def _notes(twin: "Twin") -> list[str]:
+    """Return of which state the prediction is, and what is supposed."""
+    return [f"learned until {_moment_text(twin.time or 0.0, twin)}", *(f"what if: {line}" for line in twin.supposed)]
 
 
 def _print_summary(prediction: "Prediction", twin: "Twin") -> None:
@@ -277,8 +278,8 @@ def _print_summary(prediction: "Prediction", twin: "Twin") -> None:
 
     echo(twin.machine.title, *_notes(twin))
     echo(*(f"with {key}: {text}" for key, text in twin.components.items()))
-    last = prediction.times[-1]
-    echo(f"{prediction.records} records from t = {prediction.times[0]:.6g} s to {last:.6g} s; intervals of 95 %")
+    first, last = (_moment_text(float(end), twin) for end in prediction.times[[0, -1]])
+    echo(f"{prediction.records} records from {first} to {last}; intervals of 95 %")
     for index, (name, unit) in enumerate(zip(prediction.outputs, prediction.units, strict=True)):
         value, low, high = (part[:, index] for part in (prediction.values, prediction.low, prediction.high))
         end = quantity_text(float(value[-1]), unit, 0.5 * float(high[-1] - low[-1]))
