@@ -76,9 +76,9 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
         result, ledger = _reject(state, predicted, checked), state.ledger
     else:
         scores = _score(state, tested)
-        result = _decide_and_update(scores.state, tested, scores)
-        result, ledger = _search_together(scores.state, tested, result, scores.ledger)
-        result, ledger = _find_input_noise(scores.state, tested, result, ledger)
+        result = _decide_and_update(scores)
+        result, ledger = _search_together(scores.state, scores.tested, result, scores.ledger)
+        result, ledger = _find_input_noise(scores.state, scores.tested, result, ledger)
     faulty = checked.faulty_sensors
     result = replace(result, faulty_sensors=faulty, notes=(*shortened, *checked.notes, *(own.text for own in faulty)))
     if result.adopted:
@@ -160,6 +160,7 @@ class _Scores:
     """What speaks for alternatives to the prediction after a window."""
 
     state: AdaptationState  # Before the window, without a test that has ended
+    tested: _TestedEstimate  # From what was known before the window: a test that has fallen adds to it
     ledger: Ledger  # With the shifts of the parameters in this window
     is_calm: bool  # Whether the window is expected, and shows nothing that the twin lacks
     test: SequentialTest | None  # Of the hypotheses, after this window; None if none is open
@@ -167,17 +168,24 @@ class _Scores:
 
 
 def _score(state: AdaptationState, tested: _TestedEstimate) -> _Scores:
-    """Screen the window, add the shifts of its parameters, and compare the hypotheses if it gives reason to."""
+    """Screen the window, add the shifts of its parameters, and compare the hypotheses if it gives reason to.
+
+    If it excludes a hypothesis on which windows agreed, it is scored again from the mixture of all that was open.
+    """
     screening, cusum = _screen(state, tested), _parameter_cusum(state, tested)
     is_calm = tested.is_expected and not screening.is_positive
     test = _continued_test(state, tested, screening)
+    if test is not None and _has_fallen(state.test, test):
+        return _score(*_restarted(state, tested))
+    if test is not None and test.best.type is FaultType.NOTHING and not tested.is_expected:
+        test = None
     is_new = test is None and not is_calm
     if is_new:
         state, test = replace(state, test=None), open_test(tested.predicted, screening)
-    return _Scores(state, replace(state.ledger, cusum=cusum), is_calm, test, is_new)
+    return _Scores(state, tested, replace(state.ledger, cusum=cusum), is_calm, test, is_new)
 
 
-def _decide_and_update(state: AdaptationState, tested: _TestedEstimate, scores: _Scores) -> WindowResult:
+def _decide_and_update(scores: _Scores) -> WindowResult:
     """Return the result of a window whose data are usable. The first of these cases that applies decides.
 
     - No test is open, and the window shows nothing that the twin lacks: the filter is updated. Parameters that this
@@ -186,7 +194,7 @@ def _decide_and_update(state: AdaptationState, tested: _TestedEstimate, scores: 
     - The window shows nothing of what opened the test: the filter is updated beside it.
     - Otherwise the decision of the test is applied.
     """
-    test, moved = scores.test, scores.ledger.cusum.moved
+    state, tested, test, moved = scores.state, scores.tested, scores.test, scores.ledger.cusum.moved
     if test is None:
         return _reset_moved(state, tested, moved) if moved else _update_filter(state, tested)
     if scores.is_new and tested.is_expected and test.is_null_possible:
@@ -218,11 +226,37 @@ def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
 def _continued_test(
     state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult
 ) -> SequentialTest | None:
-    """Return the open test after the window; None if there is none, or if the window shows something else."""
+    """Return the open test after the window; None if there is none."""
     if state.test is None:
         return None
-    test = continue_test(state.test, tested.predicted, screening).with_filter(tested.estimated.fit)
-    return None if test.best.type is FaultType.NOTHING and not tested.is_expected else test
+    return continue_test(state.test, tested.predicted, screening).with_filter(tested.estimated.fit)
+
+
+def _has_fallen(before: SequentialTest | None, after: SequentialTest) -> bool:
+    """Whether windows agreed on a hypothesis that the last one excludes: the null or one of a new search leads."""
+    if before is None or before.best.type is FaultType.NOTHING or before.counts.leading == 1:
+        return False
+    own, is_found_anew = before.best.hypothesis.name, after.counts.since_search == 1
+    is_kept = own in [item.hypothesis.name for item in after.hypotheses]
+    if after.best.hypothesis.name == own:  # a new search states the same again, with other values
+        return is_found_anew
+    return not is_kept and (is_found_anew or after.best.type is FaultType.NOTHING)
+
+
+def _restarted(state: AdaptationState, tested: _TestedEstimate) -> tuple[AdaptationState, _TestedEstimate]:
+    """Return the state without its test, with the mixture of all that was open before the window, and its estimate.
+
+    The hypotheses have learned from windows that the filter has not, so that it begins where they are.
+    """
+    test, filtered = state.test, state.posterior
+    null = next((item for item in test.hypotheses if item.type is FaultType.NOTHING), None) if test else None
+    if test is None or null is None or null.problem.free != filtered.problem.free:
+        return replace(state, test=None), tested
+    known = filtered.held(tested.predicted)
+    mixed = mixture(test.hypotheses, test.probabilities, state.problem, known, test.wrong_probability)
+    posterior = replace(null.posterior, problem=filtered.problem).set_prior(mixed)
+    window = tested.estimated.fit.window
+    return replace(state, posterior=posterior, test=None), _TestedEstimate.of(posterior.predict(window), window)
 
 
 def _parameter_cusum(state: AdaptationState, tested: _TestedEstimate) -> ParameterCusum:
