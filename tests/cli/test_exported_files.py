@@ -127,6 +127,15 @@ def test_differences_of_times_are_refused(tmp_path: Path) -> None:
         otolith("check", can_machine(tmp_path), table(tmp_path, "\n".join(rows) + "\n", "bus.log"))
 
 
+@pytest.mark.parametrize("above", ["", "internal events logged\n", "Begin Triggerblock Tue Mar 17 10:00:00 am 2026\n"])
+def test_the_first_frame_of_an_asc_log_counts_whatever_stands_above_it(tmp_path: Path, above: str) -> None:
+    rows = ["date Tue Mar 17 10:00:00.000 am 2026", "base hex  timestamps absolute"]
+    frames = [f"   {i / 100:.6f} 1  64             Rx   d 8 F0 00 {i:02X} 00 00 00 00 00" for i in range(60)]
+    text = "\n".join(rows) + "\n" + above + "\n".join(frames) + "\n"
+    document = checked(can_machine(tmp_path), table(tmp_path, text, "bus.asc"))
+    assert (document["rows"], document["start"]) == (60, pytest.approx(0.0))
+
+
 OTHER_TOOLS = {
     "spy.csv": "Spy Setup File,x\n\nLine,Abs Time(Sec),Rel Time (Sec),Er,Tx,Description,Arb ID,Xtd,B1,B2\n"
     "1,2550.368,0.01,F,F,HS CAN $64,064,F,F0,00\n",

@@ -345,6 +345,7 @@ class TextFormat:
     title: str
     line: re.Pattern[str] | None = None  # How each line with a frame begins, if the reader does not check that
     prelude: str = ""  # A line that the reader skips when it is started again in the middle of the file
+    ends_header: bool = False  # Whether that line must be above the first frame, which the reader else skips
 
 
 class _TrcReader(can.TRCReader):
@@ -355,7 +356,7 @@ class _TrcReader(can.TRCReader):
 
 
 TEXT_FORMATS = {
-    readers.ASC: TextFormat(can.ASCReader, readers.ASC, prelude="\n"),
+    readers.ASC: TextFormat(can.ASCReader, readers.ASC, prelude="\n", ends_header=True),
     readers.TRC: TextFormat(_TrcReader, readers.TRC),
     readers.CANDUMP_LOG: TextFormat(
         can.CanutilsLogReader, "candump, as 'candump -L' writes it", readers.TEXT_LOGS[readers.CANDUMP_LOG]
@@ -390,6 +391,7 @@ class _NumberedLines:
     def __init__(self, text: TextIO) -> None:
         self.number = 0
         self.line = self.prelude = ""
+        self.above_frames = ""  # A line that is put above the first one that begins with a number
         self._text = text
         self._next = text.readline(MAX_LINE)
 
@@ -400,6 +402,9 @@ class _NumberedLines:
         if self.prelude:
             prelude, self.prelude = self.prelude, ""
             return prelude
+        if self.above_frames and self._next.lstrip()[:1].isdigit():
+            above, self.above_frames = self.above_frames, ""
+            return above
         if not self._next:
             raise StopIteration
         self.line, self._next = self._next, self._text.readline(MAX_LINE)
@@ -424,6 +429,7 @@ class TextFrames:
     def __init__(self, path: Path, kind: TextFormat, text: TextIO, dates: LocalDates) -> None:
         self._path, self._kind, self._dates = path, kind, dates
         self._lines = _NumberedLines(text)
+        self._lines.above_frames = kind.prelude if kind.ends_header else ""
         self._taken = 0
 
     @property

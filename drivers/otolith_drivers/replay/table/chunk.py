@@ -90,12 +90,14 @@ class TableChunk:
         if self._header.date is not None:
             texts[TIME] = with_dates(pc.list_element(cells, self._header.date), texts[TIME])
         self._find_decimal_sign(texts)
-        times = self._seconds(texts[TIME])
+        of_all = self._seconds(texts[TIME]) if self._variable is None or self._clock.counts_midnights else None
         if self._variable is not None:
             own = self._of_variable(cells, self._variable)
-            kept, times, cells = kept[own], times[own], cells.filter(pa.array(own))
+            kept, cells = kept[own], cells.filter(pa.array(own))
+            of_all = None if of_all is None else of_all[own]
             texts = {name: text.filter(pa.array(own)) for name, text in texts.items()}
             texts = self._valid(texts, cells, self._variable)
+        times = self._seconds(texts[TIME]) if of_all is None else of_all
         places = [column.place for column in columns.values()] if self._header.is_shared else None
         timed = self._timed(times, texts.pop(TIME), text_of(cells, places), kept)
         kept = kept[timed]

@@ -87,6 +87,11 @@ class Clock:
         times[dates] = [self._of_text(cell) for cell in cells]
         return times
 
+    @property
+    def counts_midnights(self) -> bool:
+        """Whether a time may depend on the cells before it, so that none may be left out."""
+        return self._has_days is not False
+
     def _begins_with_time_of_day(self, written: Array, dates: Integers, cells: Sequence[str]) -> bool | None:
         """Whether the first time is one of the day: then all are, or none is; None if no cell is a time."""
         first = np.flatnonzero(np.isfinite(written))
