@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from otolith.adaptation.state import apply_decisions, initial_state
+from otolith.adaptation.state import ComponentRecord, apply_decisions, initial_state
 from otolith.cli.commissioning import commission as commission_module
 from otolith.cli.commissioning import noise
 from otolith.cli.commissioning.commission import Manner
@@ -19,6 +19,8 @@ from otolith.commissioning import own_values
 from otolith.commissioning.delays import IdentifiedDelays
 from otolith.commissioning.identification import AT_REST, CONSTANT, IdentifiedNoise, NoiseLevel
 from otolith.commissioning.value_search import OwnValue, OwnValues
+from otolith.discovery.decision import AdoptedComponent
+from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded, replay_recorder
 from otolith.storage.history import describe_machine, history_directory
@@ -171,6 +173,24 @@ def test_levels_that_a_record_does_not_determine_stay_as_they_are(
     assert written.problem.process_noise == machine.problem.process_noise
     noise = {"i": "0.006 A", "omega": "0.006 rad/s"} if has_sensors else {}
     assert tables(file) == before | {"noise": before["noise"] | noise}
+
+
+def test_what_was_found_with_other_values_is_not_asked_about(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the values of an example it may explain nothing but them; approved, it would stay."""
+
+    def nothing(*_: object) -> None:
+        raise UnusableData("no window can be used")
+
+    with_limits(ran)
+    found(monkeypatch, 6.6)
+    monkeypatch.setattr(noise, "identified_record", nothing)
+    store = store_of(load_machine(ran, with_driver=False))
+    component = Component("shaft", "linear", "V_a", amplitude=0.0968)
+    record = ComponentRecord(AdoptedComponent(component, 0.0), (0.0968,), (0.002,))
+    monkeypatch.setattr(type(store), "components", lambda _: (record,))
+    result = otolith("commission", ran, *SPAN, "--windows", "4", "--write", "--yes")
+    assert_says(result.stderr, component.key, "values before")
+    assert not store.decisions().approved | store.decisions().rejected
 
 
 LIMITS = {"watch": ["-10 %", "+10 %"], "act": ["-20 %", "+20 %"], "low": "4 ohm"}

@@ -460,10 +460,15 @@ def _commission_running(
         echo("a running daemon takes these lines over when it is started again", err=True)
     known = store.decisions()
     records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
+    has_new_values = machine.file.parameters != before.file.parameters
+    if has_new_values and records:
+        names = ", ".join(map(key_of_record, records))
+        echo(f"{names}: found with the values before, so nothing is asked; the daemon that starts drops it", err=True)
+        records = []
     approved, rejected = asked(machine, records, decide=how.decide)
     if records:
         _decide(store, approved, rejected)
-    if machine.file.parameters == before.file.parameters:
+    if not has_new_values:
         histories, advice = _estimated(machine, reader, span)
     else:  # what was estimated with other values does not count
         state, advice = _replayed(machine, data, how)
