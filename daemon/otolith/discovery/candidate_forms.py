@@ -7,7 +7,7 @@ equations.
 """
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -108,18 +108,14 @@ class PhysicalRange:
         self._moving = [*(state.name for state in base.states), *(driven.name for driven in base.inputs)]
         self._columns = {name: rows[name] for name in self._moving}
         self._columns |= {each.name: np.array([parameters[each.name]]) for each in base.parameters}
-        rates = np.array([np.abs(np.diff(rows[each.name]) / np.diff(times)).max(initial=0.0) for each in base.states])
-        drives = [{}, *self._declared_inputs()]
-        self._balances = rates + np.array([self._largest_sums(inputs) for inputs in drives])
-        """(3, states): the largest sum of all magnitudes in a balance, inputs observed, lowest, highest."""
-        self._coefficients = [self._coefficients_of(site) for site in range(len(base.sites))]
+        self._of_sites: dict[int, dict[int, Array]] = {}
 
     def amplitudes(self, form: CandidateForm, inner: float) -> tuple[float, float]:
         """Return the lowest and the highest amplitude of a form with that inner parameter, or ±UNLIMITED."""
         if form.site >= len(self._base.sites):
             return -UNLIMITED, UNLIMITED
         reach, low, high = UNLIMITED, -UNLIMITED, UNLIMITED
-        for state, coefficient in self._coefficients[form.site].items():
+        for state, coefficient in self._coefficients_of(form.site).items():
             reach = min(reach, self._balanced(state, coefficient, form, inner))
             if form.model.dissipates and self._is_force_at_speed(state, form):
                 low, high = self._dissipating(state, float(np.median(coefficient)), form, inner)
@@ -127,6 +123,19 @@ class PhysicalRange:
 
     def _coefficients_of(self, site: int) -> dict[int, Array]:
         """Return the states into whose rates a site enters, and its coefficients (records,) there."""
+        if site not in self._of_sites:
+            self._of_sites[site] = self._slopes_of(site)
+        return self._of_sites[site]
+
+    @cached_property
+    def _balances(self) -> Array:
+        """(3, states): the largest sum of all magnitudes in a balance, inputs observed, lowest, highest."""
+        steps = np.diff(self._times)
+        moved = [np.abs(np.diff(self._columns[each.name]) / steps).max(initial=0.0) for each in self._base.states]
+        drives = [{}, *self._declared_inputs()]
+        return np.asarray(np.array(moved) + np.array([self._largest_sums(inputs) for inputs in drives]))
+
+    def _slopes_of(self, site: int) -> dict[int, Array]:
         more, less = (rate_terms(self._base, self._columns, site, sign * PROBE) for sign in (1.0, -1.0))
         slopes = [(a.sum(axis=0) - b.sum(axis=0)) / (2.0 * PROBE) for a, b in zip(more, less, strict=True)]
         return {state: slope for state, slope in enumerate(slopes) if slope.any()}

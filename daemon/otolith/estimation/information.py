@@ -14,7 +14,7 @@ Filtering Theory, section 9.3).
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import islice
 
 import numpy as np
@@ -24,6 +24,7 @@ from otolith.estimation.evidence import Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
+from otolith.twin.kernel import Indices
 from otolith_drivers.units import unit_text
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
@@ -157,10 +158,17 @@ def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
     does not average out, so the largest long-run variance of an output counts (W. K. Newey, K. D. West, Econometrica
     55, 1987).
     """
-    long_run = max(cost, 1.0) ** 2
-    for column, measured in zip(residuals.T, present.T, strict=True):
-        long_run = max(long_run, _long_run_variance(column if measured.all() else column[measured]))
+    columns = residuals.T if present.all() else [own[there] for own, there in zip(residuals.T, present.T, strict=True)]
+    long_run = max(cost**2, 1.0, *map(_long_run_variance, columns))
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
+
+
+@lru_cache(maxsize=16)
+def _sums_of_lags(records: int) -> tuple[int, Indices, Array]:
+    """Return how many lags count in so many records, where the sums of them begin, and what chance makes of each."""
+    lags = int(MAX_LAG * records)
+    starts = 2 ** np.arange(max(lags - 1, 0).bit_length()) - 1
+    return lags, starts, CORRELATED * np.sqrt(np.diff(starts, append=lags - 1) / max(records, 1))
 
 
 def _long_run_variance(series: Array) -> float:
@@ -172,16 +180,16 @@ def _long_run_variance(series: Array) -> float:
     (initial positive sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CORRELATED`` it does so by degrees.
     """
     records = len(series)
-    lags = int(MAX_LAG * records)
+    lags, starts, by_chance = _sums_of_lags(records)
     variance = float(series @ series) / max(records, 1)
     if lags < 2 or variance == 0.0 or not np.isfinite(variance):
         return variance
     spectrum = np.abs(np.fft.rfft(series, 2 ** (records + lags).bit_length())) ** 2
     covariances = np.fft.irfft(spectrum)[1:lags] / (records * variance)
-    starts = 2 ** np.arange((lags - 1).bit_length()) - 1
     sums = np.add.reduceat(covariances, starts)
-    by_chance = CORRELATED * np.sqrt(np.diff(starts, append=lags - 1) / records)
-    kept = np.minimum.accumulate(np.clip(1.0 + sums / by_chance, 0.0, 1.0))
+    if (sums <= by_chance).all():
+        return variance
+    kept = np.minimum.accumulate(np.minimum(np.maximum(1.0 + sums / by_chance, 0.0), 1.0))
     larger = np.maximum(sums, by_chance)
     return variance * (1.0 + 2.0 * float(np.sum(kept * larger * (1.0 - (by_chance / larger) ** 2))))
 

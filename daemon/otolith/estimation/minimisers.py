@@ -106,9 +106,10 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
     free = ~(((low >= 0.0) & (first > 0.0)) | ((high <= 0.0) & (first < 0.0)))
     step, gradient = np.zeros(len(first)), first
     while free.any():
-        root = size[free]
-        scaled = damped[free][:, free] / (root[:, None] * root)
-        step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
+        root, system, right = size, damped, gradient
+        if not free.all():
+            root, system, right = size[free], damped[free][:, free], gradient[free]
+        step[free] = -np.linalg.solve(system / (root[:, None] * root), right / root) / root
         beyond = free & ((step < low) | (step > high))
         if not beyond.any():
             break
