@@ -462,8 +462,8 @@ def _commission_running(
     records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
     has_new_values = machine.file.parameters != before.file.parameters
     if has_new_values and records:
-        names = ", ".join(map(key_of_record, records))
-        echo(f"{names}: found with the values before, so nothing is asked; the daemon that starts drops it", err=True)
+        keys = ", ".join(map(key_of_record, records))
+        echo(f"{keys}: found with the values before, so nothing is asked; the daemon that starts drops it", err=True)
         records = []
     approved, rejected = asked(machine, records, decide=how.decide)
     if records:
