@@ -135,7 +135,7 @@ SITUATIONS = (
            Change(terms={"carriage": Term("constant", "", 30.0)})),
     _plant("two_mass", "stiffness - 35 %", "shaft or coupling is softer", "ACT", _changed("two_mass", "k_s", 0.65)),
     _plant("two_mass", "load friction x 3", "friction has risen", "ACT", _changed("two_mass", "D_l", 3.0)),
-    _plant("two_mass", "sensor of load speed 5 % off", "sensor is wrong", "ACT", Change(gains={"omega_l": 1.05})),
+    _plant("two_mass", "sensor of load speed 5 % off", "sensor is wrong", "WATCH", Change(gains={"omega_l": 1.05})),
     _plant("pump", "pipe x 2", CLASS, "WATCH", _changed("pump", "k_v", 2.0)),
     _plant("pump", "friction x 3", CLASS, "WATCH", _changed("pump", "T_c", 3.0)),
     _plant("pump", "flow sensor + 3", "sensor is wrong", "ACT", Change(offsets={"Q": 3.0})),

@@ -15,7 +15,7 @@ from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
 from otolith.estimation.sensor_models import SensorModel
-from otolith.health.diagnosis import LIMITS, MonitoringPlan, Rule, RulesFile, worded
+from otolith.health.diagnosis import COMMAND, LIMITS, MonitoringPlan, Rule, RulesFile, worded
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity
 from otolith.health.schema import Language
 from otolith.health.text import texts_in
@@ -388,7 +388,10 @@ def _plan(
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)
     rules = (*(Rule(**rule.model_dump(), is_own=True) for rule in file.rule), *load_rules(language))
-    return MonitoringPlan(parameters, components, rules, language=language, timezone=zone, known=known, signals=signals)
+    commands = frozenset(row.name for row in twin.inputs if row.hold == "zoh")
+    return MonitoringPlan(
+        parameters, components, rules, language=language, timezone=zone, known=known, signals=signals, commands=commands
+    )
 
 
 def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> frozenset[str]:
@@ -455,7 +458,9 @@ def _check_rules(file: MachineFile, twin: Definition, context: Context) -> None:
     subjects = [row.name for row in twin.parameters] + [row.name for row in twin.sites] + [*signal_units(file, twin)]
     subjects += [str(table.get("name", table.get("type"))) for table in file.drivers]
     inputs = [source.name.partition("(")[0] for source in sources(twin) if source.name]
-    known = {"twin": [twin.name], "subject": subjects, "family": list(FAMILY_NAMES), "input": inputs}
+    units = [row.unit for row in twin.sites]
+    known = {"twin": [twin.name], "subject": subjects, "unit": units, "family": list(FAMILY_NAMES)}
+    known["input"] = [*inputs, COMMAND]
     ids = [rule.id for rule in file.rule]
     for number, rule in enumerate(file.rule):
         if (first := ids.index(rule.id)) < number:

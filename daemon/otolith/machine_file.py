@@ -178,7 +178,7 @@ class EstimationTable(StrictModel):
 
     open_loop: bool = False  # Use the paper's cost: no innovation correction within a window, and sensor noise only
     determined_within: Annotated[float, BeforeValidator(Quantity("1", 1e-6, 1.0))] = 0.1
-    """A parameter is determined when half its 95 % interval is at most this share of its nominal value."""
+    """A parameter is determined when half its 95 % interval is at most this share of its value; see Problem."""
 
 
 class DiscoveryTable(StrictModel):

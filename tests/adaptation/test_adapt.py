@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -12,8 +13,10 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.discovery.alternatives import ACCEPTED, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.estimation import data_checks
+from otolith.estimation.information import QUANTILE, Identifiability
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
+from otolith.health.schema import ParameterDocument
 from otolith.machine import find_twin, load_machine
 from otolith.twin.kernel import Kernel
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -61,6 +64,31 @@ def test_healthy_window_passes_at_most_twelve_modules(windows: Cut) -> None:
     assert report.document.decision is WindowDecision.LEARNED
     core = {name for name in called if name.startswith(PACKAGES)}
     assert len(core) <= MAX_MODULES, " ".join(sorted(core))
+
+
+@pytest.mark.parametrize("margin", [1.2, 0.8])
+def test_whether_a_parameter_is_determined_does_not_depend_on_the_guess(
+    scenario: MotorScenario, windows: Cut, margin: float
+) -> None:
+    """The rows are the same, and so are value and interval; only the value in the machine file differs."""
+    (window, _), *_ = windows(scenario.model_copy(update={"faults": ()}), 1)
+    known = tuple((own.name, own.nominal) for own in DC_MOTOR.parameters if own.name != "R_a")
+    true = DC_MOTOR.parameter("R_a").nominal
+
+    def published(guess: float, within: float) -> ParameterDocument:
+        free = replace(DC_MOTOR.parameter("R_a"), nominal=guess, low=0.2 * true, high=5.0 * true)
+        problem = Problem(DC_MOTOR, known, (free,), (0.005, 0.02), input_noise=(0.0, 0.0002), determined_within=within)
+        return adapt(initial_state("motor", "here", problem), window)[1].document.parameters["R_a"]
+
+    first = published(true, 1.0)
+    assert first.value is not None
+    assert first.sd is not None
+    own = margin * QUANTILE * first.sd / first.value
+    found = [published(factor * true, own) for factor in (0.5, 1.0, 2.0)]
+    assert {item.value is not None for item in found} == {margin > 1.0}
+    assert {item.identifiability for item in found} == {
+        Identifiability.DETERMINED if margin > 1.0 else Identifiability.WEAK
+    }
 
 
 def test_healthy_window_has_one_objective_and_kalman_pass(scenario: MotorScenario, windows: Cut) -> None:

@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.experiment_design import NO_EXPERIMENT, Situation, deciding_experiment
+from otolith.discovery.experiment_design import NO_EXPERIMENT, Situation, deciding_experiment, moves
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis
 from otolith.estimation.information import Prior, extend_prior
 from otolith.estimation.posterior import Posterior
@@ -90,6 +90,14 @@ def test_a_change_of_speed_tells_a_late_speed_from_nothing_and_from_an_inertia()
         for pair in ((late, other), (other, late)):
             text = deciding_experiment(*pair, STILL)
             assert_says(text, "V_a", "V", f"{STEADY[0]:.3g}")
+
+
+def test_an_input_that_is_almost_zero_is_written_as_zero() -> None:
+    """Seen: "a step of V_a from 1.82e-48 to 4.8 V"."""
+    situation = Situation(np.array([1.82e-48, 0.0]), np.zeros(2), RECORDS, PERIOD)
+    texts = [move.text for move in moves(PROBLEM, situation)]
+    assert any("V_a from 0 to " in text for text in texts)
+    assert not any("e-48" in text for text in texts)
 
 
 def test_noise_is_told_from_nothing_by_the_size_of_innovations() -> None:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.discovery.alternatives import WindowDecision
-from otolith.discovery.decision import decide
+from otolith.discovery.alternatives import ACCEPTED, WindowDecision
+from otolith.discovery.decision import AdoptedComponent, count_fading, decide
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis
 from otolith.discovery.same_statement import prune, without_insignificant
 from otolith.discovery.sequential_test import FilterEvidence, SequentialTest, WindowCounts, is_usable, join
@@ -104,6 +104,29 @@ def test_a_sensor_is_named_only_if_no_structure_is_left(inflation: float, named:
     assert decide(test, learned=10).decision is (WindowDecision.SENSOR if named else WindowDecision.SUSPECTED)
 
 
+def of_moved(kind: FaultType, value: float, inflation: float = 1.0) -> SequentialTest:
+    """A test that an inertia of ``value`` leads, by a hypothesis of this type."""
+    wider = replace(BARE, free=(R_A, J), known=tuple(pair for pair in KNOWN if pair[0] != "J"))
+    null = hypothesis(FaultType.NOTHING, wider).worse_by(60.0, 60.0)
+    moved = replace(hypothesis(kind, wider, J=(value, 0.01 * J.nominal)), inflation=inflation)
+    return SequentialTest(wider, (moved, null), 0.0, counts=WindowCounts(5, 5, 5))
+
+
+@pytest.mark.parametrize("kind", [FaultType.PARAMETER, FaultType.NOISE])
+@pytest.mark.parametrize(("value", "accepted"), [(1.3 * J.nominal, True), (-J.nominal, False), (J.low / 5.0, False)])
+def test_no_hypothesis_with_a_negative_mass_is_accepted(kind: FaultType, value: float, *, accepted: bool) -> None:
+    """At a constant speed nothing shows a mass, and linear updates may make it negative."""
+    outcome = decide(of_moved(kind, value), learned=10)
+    assert (outcome.decision in ACCEPTED) == accepted
+    assert accepted or outcome.decision is WindowDecision.SUSPECTED
+
+
+@pytest.mark.parametrize(("inflation", "accepted"), [(1.2, True), (1.8, False)])
+def test_a_sudden_change_is_accepted_only_if_no_structure_is_left(inflation: float, *, accepted: bool) -> None:
+    outcome = decide(of_moved(FaultType.PARAMETER, 1.3 * J.nominal, inflation), learned=10)
+    assert (outcome.decision is WindowDecision.STEPPED) == accepted
+
+
 def evidence_after(*differences: float) -> FilterEvidence:
     """Evidence about the filter after windows in which its χ² exceeds the best by so many variance factors."""
     evidence, best = FilterEvidence(), LogEvidence(400.0, discount=2.0)
@@ -130,6 +153,18 @@ def test_windows_after_the_first_are_evidence_about_the_filter(
     evidence = evidence_after(*differences)
     assert (evidence.is_against, evidence.is_for) == (against, supporting)
     assert (evidence.probability > 0.5) == (sum(differences) < 0.0)
+
+
+@pytest.mark.parametrize(("rate", "fades"), [(1.355, True), (0.001, False)])
+def test_what_dies_away_fades_by_the_effect_that_it_has_now(rate: float, *, fades: bool) -> None:
+    """Seen for ever after a coast-down: 0.066·exp(−1.355·t); its amplitude is that of its onset."""
+    component = Component("shaft", "negative exponential", "t", 0.066, rate, 1e-4, 10.0)
+    problem = augment(BARE, [component])
+    certain = dict(zip((free.name for free in problem.free[1:]), [(0.066, 1e-4), (rate, 1e-4)], strict=False))
+    posterior = hypothesis(FaultType.COMPONENT, problem, **certain).posterior
+    posterior = replace(posterior, belief=replace(posterior.belief, end=10.0))
+    (counted,) = count_fading((AdoptedComponent(component, 0.0),), posterior)
+    assert (counted.fading == 1) == fades
 
 
 def test_a_component_that_leaves_structure_does_not_lead() -> None:

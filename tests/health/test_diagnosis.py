@@ -1,5 +1,6 @@
 """The rules of the diagnosis: one contract over each row, and classes where the data do not distinguish."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -43,7 +44,8 @@ def test_every_rule_names_what_exists(rule: Rule) -> None:
     assert set(rule.twin) <= set(TWINS)
     assert set(rule.subject) <= (PARAMETERS if rule.finding is FindingKind.LIMIT else SITES)
     assert set(rule.family) <= set(FAMILY_NAMES)
-    assert set(rule.input) <= {"t", "angle"}
+    assert set(rule.input) <= ({"command"} if rule.finding is FindingKind.SENSOR else {"t", "angle"})
+    assert set(rule.unit) <= {site.unit for twin in TWINS.values() for site in twin.sites}
     for text in (rule.condition, rule.cause, rule.advice, rule.source):
         assert text == text.strip()
         assert text
@@ -85,11 +87,15 @@ def test_every_parameter_with_limits_and_every_site_belongs_to_a_part(name: str)
         ),
         (FindingFeatures(FindingKind.LIMIT, "dc_motor", "K_e", "below"), "the magnetic field of the motor is weaker"),
         (
-            FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=1.0),
+            FindingFeatures(
+                FindingKind.COMPONENT, "dc_motor", "shaft", unit="N*m", family="periodic", input="angle", order=1.0
+            ),
             "unbalanced shaft",
         ),
         (
-            FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=2.0),
+            FindingFeatures(
+                FindingKind.COMPONENT, "dc_motor", "shaft", unit="N*m", family="periodic", input="angle", order=2.0
+            ),
             "shaft misalignment",
         ),
         (
@@ -109,14 +115,58 @@ def test_an_uncertain_order_leaves_the_condition_that_its_interval_holds(order: 
     """As after hours at rest, when the order has become uncertain."""
     reach = 0.05 if is_unbalance else 0.001
     features = FindingFeatures(
-        FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=order, order_reach=reach
+        FindingKind.COMPONENT,
+        "own",
+        "rotor",
+        unit="N*m",
+        family="periodic",
+        input="angle",
+        order=order,
+        order_reach=reach,
     )
     condition = diagnose(RULES, features)["condition"]
     assert (condition == "unbalanced shaft") == is_unbalance
 
 
+SHAFT = FindingFeatures(FindingKind.COMPONENT, "own", "rotor", unit="N*m", family="periodic", input="angle")
+
+
+@pytest.mark.parametrize(
+    ("features", "words", "not_words"),
+    [
+        (replace(SHAFT, order=1.0), ("unbalance",), ()),
+        (replace(SHAFT, order=0.273), ("whole number",), ("unbalance",)),
+        (replace(SHAFT, order=1.6), ("whole number",), ("unbalance", "misalign")),
+        (replace(SHAFT, unit="V", order=1.0), ("voltage",), ("unbalance",)),
+        (replace(SHAFT, unit="V", input="t"), ("voltage",), ("unbalance",)),
+        (replace(SHAFT, subject="shaft", unit="1", order=1.0), ("repeats",), ("unbalance",)),
+        (replace(SHAFT, unit="V", family="Coulomb", input="i"), ("voltage drop",), ("friction",)),
+        (replace(SHAFT, family="negative exponential", input="t"), ("dies away",), ("crack",)),
+        (FindingFeatures(FindingKind.COMPONENT, "hydraulic_actuator", "flow", unit="m^3/s", family="linear", input="t"),
+         ("drifts",), ("leakage",)),
+        (FindingFeatures(FindingKind.COMPONENT, "hydraulic_actuator", "flow", unit="m^3/s", family="linear", input="p"),
+         ("leakage flow",), ("drifts",)),
+    ],
+)  # fmt: skip
+def test_a_component_is_named_by_what_it_adds_and_not_by_the_name_of_its_site(
+    features: FindingFeatures, words: tuple[str, ...], not_words: tuple[str, ...]
+) -> None:
+    condition = diagnose(RULES, features)["condition"]
+    assert_says(condition, *words)
+    assert not [word for word in not_words if word in condition]
+
+
+def test_gas_in_a_pump_sends_nobody_to_the_terminals_first() -> None:
+    for twin in ("pump", "dc_motor"):
+        advice = diagnose(RULES, FindingFeatures(FindingKind.RETURNS, twin))["advice"]
+        assert advice.index("the times") < min(
+            advice.find(word) for word in ("contacts", "terminals") if word in advice
+        )
+    assert "venting" in diagnose(RULES, FindingFeatures(FindingKind.RETURNS, "pump"))["advice"]
+
+
 def test_conditions_that_the_data_do_not_distinguish_are_one_class() -> None:
-    constant = FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="constant")
+    constant = FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", unit="N*m", family="constant")
     diagnosis = diagnose(RULES, constant)
     assert_says(diagnosis["condition"], "constant torque", "shaft", "offset of the load sensor")
     assert "without load" in diagnosis["advice"]

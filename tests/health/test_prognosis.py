@@ -19,13 +19,14 @@ from otolith.health.prognosis import (
     errors_of_means,
     find_trend,
     forecast,
+    is_due,
     is_plausible,
     span,
     with_point,
 )
-from otolith.health.schema import CrossingDocument
+from otolith.health.schema import CrossingDocument, ForecastDocument
 from otolith.health.text import crossing_text, duration_text, event_text
-from tests.health.test_events import PLAN, changes, report
+from tests.health.test_events import PLAN, assessed, changes, report
 from tests.messages import assert_says
 from tests.variants import often
 
@@ -220,6 +221,77 @@ def test_a_clock_that_is_set_keeps_a_history_usable() -> None:
     assert is_plausible(back)
     assert not is_plausible(((2.0, 1.0, 1.0), (1.0, 1.0, 1.0)))
     assert not is_plausible(((2.0, 1.0, 0.0),))
+
+
+def ramp_with_an_end(seed: int, kind: str) -> tuple[History, History, float]:
+    """A history until a change has ended, the estimates after that, and the size of their errors.
+
+    The change is a ``ramp`` of random slope, a ``step``, or a ramp and its ``repair``. No point is a mean of several.
+    """
+    random = np.random.default_rng(seed)
+    before, during, after = (int(random.uniform(*range_)) for range_ in ((30, 70), (40, 100), (30, 31)))
+    share, noise, rho = random.uniform(0.3, 0.9), NOMINAL * random.uniform(3e-4, 1e-3), random.choice([0.0, 0.5, 0.8])
+    ramp = np.full(during, 1.0) if kind == "step" else np.linspace(0.0, 1.0, during)
+    shape = np.concatenate([np.zeros(before), ramp, np.full(after, 0.0 if kind == "repair" else 1.0)])
+    values = NOMINAL - 0.65 * share * shape + noise * correlated(len(shape), rho, random)
+    history = history_of(values.tolist(), sd=noise)
+    return history[: before + during], history[before + during :], noise
+
+
+@pytest.mark.parametrize("kind", ["ramp", "step", "repair"])
+@pytest.mark.parametrize("seed", often(range(3), range(12)))
+def test_a_forecast_ends_with_its_trend(kind: str, seed: int) -> None:
+    """Seen on a winding: "ACT in 88 s to 109 s", 100 s after its ramp had ended."""
+    until, later, _ = ramp_with_an_end(seed, kind)
+    if kind == "ramp":
+        assert forecast(QUANTITY, until).act is not None
+    for count in (15, 30):
+        ended = forecast(QUANTITY, (*until, *later[:count])).act
+        assert ended is None or ended.high is None or ended.low > later[-1][0] + 300.0
+
+
+@pytest.mark.full
+def test_the_first_forecasts_of_random_ramps_hold_as_often_as_they_say() -> None:
+    """Each is the first one after the onset of a ramp, which few estimates show: the time left was a quarter of it."""
+    held, ratios = list[bool](), list[float]()
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        before, during = int(random.uniform(30.0, 100.0)), int(random.uniform(50.0, 200.0))
+        noise, rho = NOMINAL * random.uniform(3e-4, 1.5e-3), random.choice([0.0, 0.5, 0.8])
+        ramp = np.maximum(np.arange(before + during) - before, 0.0) / during
+        values = NOMINAL - 0.65 * ramp + noise * correlated(len(ramp), rho, random)
+        history, end = history_of(values.tolist(), sd=noise), 2.0 * (before + during + 1)
+        forecasts = (forecast(QUANTITY, history[:count]) for count in range(before + 10, before + during, 3))
+        first = next((item for item in forecasts if item.act is not None), None)
+        if first is not None and first.act is not None:
+            held.append(first.act.low <= end <= (first.act.high or np.inf))
+            ratios.append((first.act.at - first.computed) / (end - first.computed))
+    assert len(held) >= 36
+    assert np.mean(held) >= 0.7
+    assert 0.8 <= np.median(ratios) <= 1.25
+
+
+def test_a_trend_that_has_ended_in_a_long_history_is_fitted_again_soon() -> None:
+    """A share of a long history may be hours."""
+    history = history_of([0.0] * 2000)
+    own = ForecastDocument(computed=history[-12][0], family="linear")
+    leads = own.model_copy(update={"act": CrossingDocument(limit=6.0, at=1e5, low=1e5, high=1e5)})
+    assert not is_due(own, history)
+    assert is_due(leads, history)
+    assert not is_due(leads.model_copy(update={"computed": history[-5][0]}), history)
+
+
+def test_no_forecast_while_windows_contradict_what_it_is_made_from() -> None:
+    """The fault of a sensor held the estimates, and the forecast stayed."""
+    random = np.random.default_rng(6)
+    falling = [report(index, NOMINAL - 0.002 * index + 0.001 * random.standard_normal(), 0.001) for index in range(90)]
+    wrong = [report(index, NOMINAL - 0.18, 0.001, decision=WindowDecision.SENSOR) for index in range(90, 100)]
+    last, *held = (document.parameters["R_a"].forecast for document in assessed([*falling, *wrong])[89:])
+    assert last is not None
+    assert last.act is not None
+    assert [item is not None and item.act is not None for item in held] == [True, True, *[False] * 8]
+    assert held[-1] is not None
+    assert held[-1].reason
 
 
 def test_the_event_and_the_report_have_the_forecast() -> None:

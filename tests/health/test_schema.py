@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -87,6 +88,15 @@ def test_report_interval_is_two_sided_95_percent() -> None:
     assert document.status is Status.ESTIMATED
     assert [document.low, document.high] == pytest.approx([5.804, 6.196], abs=1e-4)
     assert document.trend_per_hour == pytest.approx(0.36)
+
+
+def test_the_interval_of_a_positive_parameter_has_no_negative_end() -> None:
+    before, wide = PreviousStatus(True, Status.ESTIMATED), MarginalPosterior(0.5, 0.5, 0.0, 1e-6)
+    positive, signed = (replace(RESISTANCE, low=low) for low in (0.1, -5.0))
+    _, document = publish(positive, ALLOWED, wide, WindowEvidence(), before)
+    assert document.low == 0.0
+    assert document.high == pytest.approx(0.5 + 1.96 * 0.5, rel=1e-3)
+    assert publish(signed, ALLOWED, wide, WindowEvidence(), before)[1].low == pytest.approx(-0.48, rel=1e-2)
 
 
 def test_status_has_hysteresis_at_its_limit() -> None:

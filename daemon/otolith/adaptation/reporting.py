@@ -24,7 +24,7 @@ from otolith.discovery.alternatives import (
     describe_setting,
     is_noisier_than_stated,
 )
-from otolith.discovery.decision import AdoptedComponent, Alternative, Approval, alternatives_of
+from otolith.discovery.decision import AdoptedComponent, Alternative, Approval, alternatives_of, is_plausible
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import SequentialTest
@@ -190,7 +190,10 @@ def _parameters(
     problem, estimated = result.posterior.problem, result.estimate
     documents: dict[str, ParameterDocument] = {}
     previous: dict[str, PreviousStatus] = {}
-    required = problem.determined_within * problem.scale
+    count = len(problem.free)
+    required = problem.required_for(result.after.mean[:count])
+    if result.is_mixture:  # a change that is not accepted yet allows no less accuracy than the value before it
+        required = np.minimum(required, problem.required_for(result.posterior.prior().mean[:count]))
     contradictions = result.contradictions(state)
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
@@ -403,7 +406,7 @@ def _findings(
     if noisier_since is not None:
         findings.append(_noise_finding(result.posterior.problem, noisier_since))
     if undecided is not None and undecided.best.type is not FaultType.NOTHING:
-        findings.append(_open_finding(undecided, result.decision, experiment))
+        findings.append(_open_finding(undecided, result, experiment))
     return tuple(findings)
 
 
@@ -434,8 +437,9 @@ def _polled_finding(command: str, since: float) -> FindingDocument:
     )
 
 
-def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: str) -> FindingDocument:
-    """Return the finding of a test that is still open after ``decision``."""
+def _open_finding(test: SequentialTest, result: WindowResult, experiment: str) -> FindingDocument:
+    """Return the finding of a test that is still open after the decision of ``result``."""
+    decision = result.decision
     fault = _data_fault(decision, test)
     kind, subject = _kind_and_subject(decision, test, fault)
     text = _hypotheses_text(test)
@@ -449,6 +453,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         condition=_what_is_new(test) if kind is FindingKind.OPEN else condition,
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
+        error=_error(fault, result.estimate),
         advice=experiment,
         setting=describe_setting(fault or test.best) or _corrected_value(test),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
@@ -487,12 +492,33 @@ def _kind_and_subject(
     return (FindingKind.MOVED, moved) if (moved := _moved_known(test)) else (FindingKind.OPEN, "")
 
 
+def _error(fault: TrackedHypothesis | None, estimated: WindowEstimate | None) -> float | None:
+    """Return the delay of a late signal, s, or the error of a sensor over the size of its signal in the window.
+
+    That of an offset is its share of the root mean square of the signal; None of what is neither, and without a size.
+    """
+    if fault is None or not (fault.problem.components or fault.problem.delays):
+        return None
+    if fault.problem.delays:
+        return fault.problem.delays[0][1]
+    slot = len(fault.problem.components) - 1
+    component, amplitude = fault.problem.components[slot], fault.posterior.prior().mean[indices(fault.problem, slot)[0]]
+    site = site_of(fault.problem.base_model, component.site)
+    if component.family == "linear" or site.mode == "multiplicative":
+        return float(amplitude)
+    if estimated is None or site.into not in (window := estimated.fit.window).signals:
+        return None
+    size = float(np.sqrt(np.nanmean(np.square(window.measured((site.into,))))))
+    return float(amplitude) / size if size > 0.0 else None
+
+
 def _moved_known(test: SequentialTest) -> str:
     """Return the parameter that the machine file gives as known and that has moved for all that the test shows."""
     names = {parameter.name for parameter in test.best.problem.free} & {name for name, _ in test.problem.known}
     probable = test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
     is_sure = probable and test.counts.leading >= COMPONENT_WINDOWS
     is_alone = test.explains_window and test.best.type is FaultType.PARAMETER and len(names) == 1
+    is_alone = is_alone and is_plausible(test.best)
     return names.pop() if is_alone and is_sure else ""
 
 

@@ -40,6 +40,7 @@ from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.global_search import search_window
+from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
@@ -90,6 +91,11 @@ class NoiseLevel:
     value: float  # Standard deviation in the unit of the output; of a state, in its unit per square root of a second
     sd: float | None = None  # Standard deviation of the value; None if it was not identified
     remark: str = NO_WINDOW  # Why it was not identified, or what limits it; empty if nothing does
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether the value is the end of its 95 % interval: the level may be anything below."""
+        return self.remark == UPPER_BOUND
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,7 +348,8 @@ def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint
     columns = (column.tolist() for column in (guess.signal_noise, best.levels, best.sd, guess.variances.floor))
     for output, shown, value, sd, floor in zip(twin.outputs, *columns, strict=False):
         if shown > 0.0:
-            yield NoiseLevel(output.name, value, sd, UPPER_BOUND if value <= sd + floor else "")
+            is_bound = value <= sd + floor
+            yield NoiseLevel(output.name, value + is_bound * QUANTILE * sd, sd, UPPER_BOUND if is_bound else "")
         else:
             yield NoiseLevel(output.name, value, None, NEVER_MEASURED if np.isnan(shown) else CONSTANT)
 

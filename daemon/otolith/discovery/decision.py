@@ -3,6 +3,7 @@
 Of an adopted component: since when and how surely it is in the twin, approved or not, and whether it fades.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -27,7 +28,7 @@ AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
-BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no sensor, delay or component is accepted
+BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no hypothesis is accepted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +50,7 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     The first rule that applies decides; ``docs/explanation/discovery.md`` has them as a table.
     """
     best, is_young = test.best, learned <= YOUNG_WINDOWS
-    if is_young and 0 < learned < test.counts.tested and (anew := _all_moved(test)) is not None:
+    if is_young and 0 < learned < test.counts.tested and (anew := _all_moved(test)) is not None and is_plausible(anew):
         return WindowOutcome(WindowDecision.STEPPED, anew)
     if best.type is FaultType.NOTHING:
         return WindowOutcome(WindowDecision.LEARNED, best)
@@ -68,32 +69,32 @@ def _is_agreed(test: SequentialTest, row: AlternativeRow, kind: FaultType, *, is
     """Whether enough windows agree that a hypothesis of type ``kind`` is probable enough.
 
     If ``is_young``, few windows have updated the filter. Where even the best hypothesis leaves structure, the cause may
-    be none of the hypotheses, and no data are wrong.
+    be none of the hypotheses: then no data are wrong, and no parameter has moved.
     """
     best, needed = test.best, max(row.windows, row.windows_while_young if is_young else 0)
-    may_be = not best.leaves_structure if row.is_of_data else best.type is kind
+    needs_all = row.is_of_data or row.decision is WindowDecision.STEPPED
+    may_be = (row.is_of_data or best.type is kind) and not (needs_all and best.leaves_structure)
     return may_be and test.counts.leading >= needed and test.probability(kind) >= row.probability
 
 
 def _outcome(test: SequentialTest, row: AlternativeRow, kind: FaultType) -> WindowOutcome | None:
     """Return the decision for the best hypothesis of a type on which windows agree; None where it is not certain."""
     accepted, decision = next(item for item in test.hypotheses if item.type is kind), row.decision
-    if decision is WindowDecision.NOISIER:
-        return WindowOutcome(decision, accepted)
     if decision is WindowDecision.STEPPED:
         own, known = ({parameter.label for parameter in each.free} for each in (accepted.problem, test.problem))
-        fewer = WindowOutcome(WindowDecision.FADED, accepted) if own < known else None  # a component is insignificant
-        return WindowOutcome(decision, accepted) if own == known else fewer
+        if not own <= known:
+            return None
+        decision = WindowDecision.FADED if own < known else decision  # a component is insignificant
     if decision is WindowDecision.DISCOVERED:
         is_alone = test.counts.tested >= MAX_OPEN_WINDOWS or not test.alternatives(accepted)
         accepted = _without_undecided_terms(test)
         if not is_alone or accepted.type is not kind:
             return None
-    is_certain = _is_plausible(accepted) and not _is_below_noise(accepted)
+    is_certain = is_plausible(accepted) and not _is_below_noise(accepted)
     return WindowOutcome(decision if is_certain else WindowDecision.SUSPECTED, accepted)
 
 
-def _is_plausible(hypothesis: TrackedHypothesis) -> bool:
+def is_plausible(hypothesis: TrackedHypothesis) -> bool:
     """Whether no positive parameter is far beyond its bounds: a mass that nothing excites may become negative."""
     rows = zip(hypothesis.problem.free, hypothesis.posterior.prior().mean.tolist(), strict=False)  # then come trends
     own = [(free, value) for free, value in rows if free.low > 0.0 and not free.name.startswith("_")]
@@ -208,6 +209,18 @@ def alternatives_of(test: SequentialTest, to: TrackedHypothesis) -> tuple[Altern
     return tuple(Alternative(item.type, describe_hypothesis(item), share) for item, share in test.alternatives(to))
 
 
+def _left(posterior: Posterior, slot: int) -> float:
+    """Return which share of its amplitude a component still has: what dies away has an effect for a while only."""
+    component = posterior.problem.components[slot]
+    if component.family != "negative exponential" or component.source != "t":
+        return 1.0
+    rate, age = (
+        float(posterior.prior().mean[indices(posterior.problem, slot)[1]]),
+        posterior.belief.end - component.origin,
+    )
+    return math.exp(-max(rate * age, 0.0))
+
+
 def count_fading(adopted: tuple[AdoptedComponent, ...], posterior: Posterior) -> tuple[AdoptedComponent, ...]:
     """Return the components with the number of windows in which each was not significant."""
     prior = posterior.prior()
@@ -219,7 +232,8 @@ def count_fading(adopted: tuple[AdoptedComponent, ...], posterior: Posterior) ->
             amplitude, discovered = abs(float(prior.mean[index])), abs(item.component.amplitude)
             doubt = INSIGNIFICANT * float(prior.sd[index])
             visible = doubt < discovered  # otherwise no window could show it
-            gone = amplitude < INSIGNIFICANT_SHARE * discovered or (visible and amplitude < doubt)
+            effect = amplitude * _left(posterior, slot)
+            gone = effect < INSIGNIFICANT_SHARE * discovered or (visible and amplitude < doubt)
             item = replace(item, fading=item.fading + 1 if gone else 0)  # noqa: PLW2901 - the counted item
         counted.append(item)
     return tuple(counted)

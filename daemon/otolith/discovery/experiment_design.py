@@ -29,6 +29,7 @@ MOVE_SHARES = (0.1, 0.25, 0.5, 1.0)  # of the input's range; the smallest move t
 MAX_RECORDS = 200  # of a simulated experiment
 MIN_REDUCTION = 0.5  # share of the present interval that a move must reach to be advised
 MIN_DISTANCE = 2.0 * DECISIVE  # expected evidence that decides with some certainty
+NEGLIGIBLE = 1e-6  # of the size of a move: an end below is zero
 OTHER_INPUTS = " if the other inputs stay as they are"
 NO_EXPERIMENT = "no change of a single input can tell these causes apart: inspect the sensors and the machine"
 
@@ -54,7 +55,7 @@ class Move:
 
 def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[str]) -> dict[str, str]:
     """Return a sentence for each ``wanted`` parameter that some move would determine, given what is ``known``."""
-    required, present = problem.determined_within * problem.scale, QUANTILE * known.sd
+    required, present = problem.required_for(known.mean[: len(problem.free)]), QUANTILE * known.sd
     best = {at: (present[at], "") for at, own in enumerate(problem.free) if own.name in wanted}
     for move in moves(problem, situation):
         searched = [at for at, (reach, _) in best.items() if reach > required[at]]
@@ -88,13 +89,19 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
     for size in MOVE_SHARES:
         for column, moved in enumerate(problem.base_model.inputs):
             low, high = _ends(moved, float(situation.inputs[column]), size)
-            step = f"a step of {moved.name} from {low:.3g} to {high:.3g} {unit_text(moved.unit)}"
-            swing = f"swinging {moved.name} between {low:.3g} and {high:.3g} {unit_text(moved.unit)}"
+            least, most = (_readable(end, abs(high - low)) for end in (low, high))
+            step = f"a step of {moved.name} from {least} to {most} {unit_text(moved.unit)}"
+            swing = f"swinging {moved.name} between {least} and {most} {unit_text(moved.unit)}"
             swing += f" twice within {records * period:.3g} s"
             for text, curve in ((step, share >= 0.25), (swing, 0.5 - 0.5 * np.cos(4.0 * np.pi * share))):
                 inputs = np.tile(situation.inputs, (records, 1))
                 inputs[:, column] = low + (high - low) * curve
                 yield Move(text, inputs)
+
+
+def _readable(end: float, move: float) -> str:
+    """Return the end of a move, with three digits; what is far below the size of the ``move`` is zero."""
+    return f"{0.0 if abs(end) < NEGLIGIBLE * move else end:.3g}"
 
 
 def _ends(moved: Input, present: float, size: float) -> tuple[float, float]:

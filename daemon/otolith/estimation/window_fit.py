@@ -437,7 +437,7 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
     objective, problem, guess = both.fit.objective, both.fit.problem, both.alone.guess
     width = objective.high - objective.low
     at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
-    required = problem.determined_within * problem.scale
+    required = problem.required_for(both.values[: len(problem.free)])
     pressure = _pressure(both, at_bound)
     estimates = []
     for index, parameter in enumerate(problem.free):
@@ -513,4 +513,4 @@ def _determines_without(estimated: WindowEstimate) -> bool:
     objective = Objective(problem, known, parameters)
     _, jacobian = objective.linearise(objective.guess(parameters))
     sd = information(jacobian, objective.high - objective.low, 1.0).sd[: objective.free]
-    return bool((QUANTILE * sd <= problem.determined_within * problem.scale).any())
+    return bool((QUANTILE * sd <= problem.required_for(parameters)).any())

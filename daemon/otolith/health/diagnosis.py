@@ -19,7 +19,9 @@ from otolith.health.text import Texts, texts_in
 from otolith_drivers.config_files import Range, StrictModel
 
 LIMITS = (FindingKind.LIMIT, FindingKind.LIMIT_FROM_START)  # Findings whose level is that of the limit
-KEYS = ("twin", "subject", "side", "manner", "family", "input")
+MATERIAL_ERROR = 0.1  # of a signal: an error of its sensor that matters whatever the limits are
+COMMAND = "command"  # Input of a wrong signal that is one
+KEYS = ("twin", "subject", "unit", "side", "manner", "family", "input")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +31,13 @@ class FindingFeatures:
     finding: FindingKind
     twin: str = ""
     subject: str = ""  # Parameter, site or signal
-    side: str = ""  # Of the nominal value on which a parameter is: below or above
+    side: str = ""  # Of the nominal value on which a parameter is, or of zero on which a delay: below or above
     manner: str = ""  # How a parameter came there, by a step or by a trend; or that it was so from the start
     family: str = ""
-    input: str = ""  # t, angle, or another signal or state
+    input: str = ""  # t, angle, or another signal or state; of a wrong signal, command if it is one
     order: float | None = None  # Of a component that is periodic in an angle
     order_reach: float = 0.0  # Half of its 95 % interval
+    unit: str = ""  # Of the site of a component: what is added there
 
 
 class _Row(StrictModel):
@@ -44,6 +47,7 @@ class _Row(StrictModel):
     finding: FindingKind
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
+    unit: tuple[str, ...] = ()
     side: tuple[Literal["below", "above"], ...] = ()
     manner: tuple[Literal["step", "trend", "from the start"], ...] = ()
     family: tuple[str, ...] = ()
@@ -115,6 +119,7 @@ class MonitoringPlan:
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
     signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings
+    commands: frozenset[str] = frozenset()  # Inputs of the twin that hold their value between samples
     varying: frozenset[str] = frozenset()  # Parameters whose sudden changes are ordinary, as of an unknown load
 
     @property
@@ -127,6 +132,17 @@ class MonitoringPlan:
         """The parts of the twin, in the order of its parameters and sites."""
         quantities = (*self.parameters.values(), *self.sites.values())
         return tuple(dict.fromkeys(quantity.part for quantity in quantities))
+
+    @property
+    def act_distance(self) -> float:
+        """Smallest share of a healthy value at which a parameter is at ACT; at most :data:`MATERIAL_ERROR`."""
+        shares = [
+            abs(limit.value / quantity.nominal - 1.0)
+            for quantity in self.parameters.values()
+            for limit in quantity.limits
+            if limit.level is Level.ACT and quantity.nominal
+        ]
+        return min([*shares, MATERIAL_ERROR])
 
     def parameters_of(self, part: str) -> list[str]:
         """Return the names of the estimated parameters of a part."""

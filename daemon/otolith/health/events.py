@@ -46,7 +46,9 @@ from otolith.health.text import PARTS, duration_text, reasons_of
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
 OF_DATA = ("data", "source/", "temperature/", OUTPUT)  # Begins of the keys of conditions that nothing was learned for
+CONTRADICTED = "the last windows contradict the estimates that a forecast is made from"
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
+NAMED = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})  # Of windows that are estimated: its cause is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,15 +180,17 @@ def missed_notes(state: HealthState, notes: Iterable[OperatorNote]) -> list[str]
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""
     report = _translated(plan, report)
-    state = _with_forecasts(plan, _with_steps(plan, state, report), report)
+    state = _with_doubts(_with_forecasts(plan, _with_steps(plan, state, report), report), report)
     parameters = {
-        name: item.model_copy(update={"forecast": state.forecasts.get(name), **_judged(plan, report, name)})
+        name: item.model_copy(
+            update={"forecast": _current_forecast(state, report, name), **_judged(plan, report, name)}
+        )
         for name, item in report.parameters.items()
     }
     report = report.model_copy(update={"parameters": parameters})
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
-    state = _with_agreement(_with_doubts(replace(state, undetermined=undetermined), report), report)
+    state = _with_agreement(replace(state, undetermined=undetermined), report)
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events, absent = {}, list[EventDocument](), set[str]()
     shelves = lasting(state.shelves, state.notes, report.window.end)
@@ -236,9 +240,10 @@ def _observations(
     """
     is_open = any(finding.kind is FindingKind.OPEN for finding in report.findings)
     absent = Level.OK if report.decision in ACCEPTED and is_moving and not is_open else None
+    is_named = report.decision in DECIDED or (report.decision in NAMED and report.fit is not None)
     earlier = {}
     for key, record in state.records.items():
-        is_decided = report.decision in DECIDED and record.persistence == UNDECIDED
+        is_decided = is_named and record.persistence == UNDECIDED
         persistence = replace(UNDECIDED, fall=1) if is_decided else record.persistence
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
@@ -376,6 +381,18 @@ def history_point(plan: MonitoringPlan, report: ReportDocument, name: str) -> tu
     return None if referred is None else (time, referred[0], referred[1] ** 2)
 
 
+def _current_forecast(state: HealthState, report: ReportDocument, name: str) -> ForecastDocument | None:
+    """Return the last forecast of a parameter; without its times while windows contradict what it was made from.
+
+    A single window may be wrong. After several the parameter may have changed, and its forecast holds no more.
+    """
+    own, last = state.forecasts.get(name), state.doubtful[-PERSISTENT_WINDOWS:]
+    is_contradicted = len(last) == PERSISTENT_WINDOWS and last[-1] - last[0] == PERSISTENT_WINDOWS - 1
+    if own is None or not is_contradicted or last[-1] != report.window.index:
+        return own
+    return ForecastDocument(computed=own.computed, reason=CONTRADICTED) if own.watch or own.act else own
+
+
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of this window in the histories, with the forecasts that are due, and trends."""
     histories, forecasts, trends = dict(state.histories), dict(state.forecasts), dict(state.trends)
@@ -399,7 +416,7 @@ def _advance(
     if observed.level is None or (before.level is Level.HINT and observed.level is Level.OK):  # a hint is given once
         is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
         return replace(before, event=event, recent=() if is_interrupted else before.recent)
-    persistence = observed.persistence
+    persistence = observed.persistence.of_windows(report.window.end - report.window.start)
     if before.returns(report.window.index if event is None else event.evidence.windows[0]):
         persistence = replace(persistence, fall=max(persistence.fall, RELEASE_WINDOWS))
     length = max(persistence.rise, persistence.fall, persistence.within)
@@ -550,10 +567,15 @@ def _kept(
 
 
 def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument) -> tuple[str, ...]:
-    """Return the parameters of a part of the twin if the value of none is known."""
-    own = plan.parameters_of(part) or list(report.parameters)
-    known = any(report.parameters[name].value is not None for name in own if name in report.parameters)
-    return () if known or part not in plan.parts else tuple(own)
+    """Return the parameters of a part of the twin that its state lacks: those with limits, and all if none is known.
+
+    Of a part without parameters of its own, it is enough that some parameter of the machine is known.
+    """
+    own = plan.parameters_of(part)
+    unknown = [name for name, item in report.parameters.items() if item.value is None and (name in own or not own)]
+    if part not in plan.parts or len(unknown) == len(own or report.parameters):
+        return tuple(own or report.parameters) if part in plan.parts else ()
+    return tuple(name for name in unknown if own and plan.parameters[name].limits)
 
 
 def _waits_for_baseline(plan: MonitoringPlan, part: str) -> bool:

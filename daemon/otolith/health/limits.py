@@ -2,7 +2,8 @@
 
 A limit is passed if the value is beyond it with a probability of 97.5 %: if the whole 95 % interval is. A level is left
 if the value is back inside the limit that was passed with the same probability, by a share of the distance to the
-nominal value. An estimate that wanders around its limit therefore changes nothing.
+nominal value, or if the interval holds the nominal value and not the limit. An estimate that wanders around its limit
+therefore changes nothing.
 """
 
 import math
@@ -110,7 +111,10 @@ class MonitoredQuantity:
         for limit in self.limits:
             excess, reach = limit.excess(value), QUANTILE * sd
             release = RELEASE * abs(limit.value - self.nominal)
-            was_passed = before.rank >= limit.level.rank and held is not None and limit.excess(held) >= 0.0
+            is_healthy = abs(value - self.nominal) <= reach < -excess  # as the healthy value may be, and inside
+            was_passed = (
+                not is_healthy and before.rank >= limit.level.rank and held is not None and limit.excess(held) >= 0.0
+            )
             if excess > reach or (was_passed and excess > -release - reach):
                 levels.append((limit.level, limit))
         return max(levels, key=lambda item: item[0].rank)

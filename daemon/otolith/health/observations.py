@@ -1,13 +1,14 @@
 """What the report of a window shows about each condition of the machine, before any persistence."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from otolith.discovery.alternatives import WindowDecision
-from otolith.discovery.decision import Approval
+from otolith.discovery.decision import INSIGNIFICANT, Approval
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, severity
+from otolith.health.diagnosis import COMMAND, FindingFeatures, MonitoringPlan, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, probability_beyond
 from otolith.health.prognosis import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith.health.schema import (
@@ -23,6 +24,7 @@ from otolith.health.text import Texts, duration_text, forecast_text, interval_te
 from otolith_drivers.units import equation_text, quantity_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
+PERSISTENT_SECONDS = 3.0  # s for which they must, where windows are shorter than a second
 INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
 MIN_RETURNS = 4  # changes among as many windows, of which each was gone before the next: one that comes and goes
@@ -52,6 +54,13 @@ class Persistence:
     rise: int = PERSISTENT_WINDOWS  # On a higher level
     fall: int = PERSISTENT_WINDOWS  # On a lower one
     within: int = 0  # Windows among which those on a higher level need not follow each other, if more than ``rise``
+
+    def of_windows(self, length: float) -> "Persistence":
+        """Return how many windows of ``length`` (s) must agree: short ones for :data:`PERSISTENT_SECONDS` as well."""
+        least = math.ceil(PERSISTENT_SECONDS / length - 1e-9) if length > 0.0 else 1
+        ratio = max(least / PERSISTENT_WINDOWS, 1.0)
+        rise, fall = (max(own, least) if own >= PERSISTENT_WINDOWS else own for own in (self.rise, self.fall))
+        return Persistence(rise, fall, math.ceil(ratio * self.within))
 
 
 UNDECIDED = Persistence(MAX_OPEN_WINDOWS, RELEASE_WINDOWS)  # Of what an open test states; it shows only with excitation
@@ -185,8 +194,17 @@ def _of_finding(
     """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
     is_from_start = finding.of_file or past.known_since is None or finding.since < past.known_since
     features = FindingFeatures(finding.kind, twin, finding.subject, manner=FROM_START if is_from_start else "")
+    if finding.kind is FindingKind.TIMING and finding.error is not None:
+        features = replace(features, side="below" if finding.error < 0.0 else "above")
+    if finding.kind is FindingKind.SENSOR and finding.subject in plan.commands:
+        features = replace(features, input=COMMAND)
     part = PARTS.get(finding.kind, MACHINE)
     level = severity(plan.rules, features)
+    # A signal that is wrong by a share moves the parameters that are estimated from it by about that share. That of an
+    # offset varies with the signal: what once was at ACT stays there.
+    is_small = finding.error is not None and abs(finding.error) < plan.act_distance
+    if level is Level.ACT and is_small and before.get(finding.id) is not Level.ACT:
+        level = Level.WATCH
     meaning, numbers = plan.signals.get(finding.subject, ""), None
     text = f"{plan.texts.translated(meaning)}: {finding.text}" if meaning else finding.text
     if (value := finding.value) is not None:
@@ -222,8 +240,7 @@ def _of_parameter(
     level, limit = quantity.level(*referred, *_held(key, before, past))
     if limit is None:
         return Observation(key, quantity.part, level)
-    may_be_healthy = max(abs(deviation), abs(limit.excess(referred[0]))) <= QUANTILE * referred[1]
-    if may_be_healthy and level is before.get(key, Level.OK):
+    if max(abs(deviation), limit.excess(referred[0])) <= QUANTILE * referred[1]:  # it may be healthy
         return Observation(key, quantity.part, None)
     manner = _manner(parameter, deviation, past.steps.get(name, 0.0))
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
@@ -232,7 +249,8 @@ def _of_parameter(
     share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
     expected = forecast_text(parameter, report.window.end, texts.language)
     change = f" ({share}{against}{_at_temperature(quantity, texts)})" if share else ""
-    what = {"what": texts.translated(quantity.meaning), "name": name, "value": value_text(parameter), "change": change}
+    judged = interval_text(*referred, unit)
+    what = {"what": texts.translated(quantity.meaning), "name": name, "value": judged, "change": change}
     ahead = {"expected": expected and f", {expected}", "warming": _warming(quantity, deviation, texts)}
     text = texts("limit", **what, beside=_beside(limit, referred[0], unit, texts), **ahead)
     return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
@@ -265,15 +283,17 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
     if seen is None or length < MIN_TREND_SPAN or seen.is_over(now):
         return Observation(key, quantity.part, Level.OK)
     crossing = next_crossing(parameter.forecast, now)
-    if crossing is None or not seen.is_lasting(now, length):
+    referred = quantity.referred(parameter.value, parameter.sd or 0.0, report.window.observed or {})
+    if crossing is None or referred is None or not seen.is_lasting(now, length):
         return Observation(key, quantity.part, None)
     if _warming(quantity, crossing.limit - quantity.nominal, plan.texts):
         return Observation(key, quantity.part, Level.OK)
     side = "below" if crossing.limit < quantity.nominal else "above"
     features = FindingFeatures(FindingKind.TREND, report.twin, name, side, "trend")
     expected = forecast_text(parameter, report.window.end, plan.language)
-    what = plan.texts.translated(quantity.meaning)
-    text = plan.texts("trend", what=what, name=name, value=value_text(parameter), expected=expected)
+    what = {"what": plan.texts.translated(quantity.meaning), "name": name, "expected": expected}
+    what |= {"value": interval_text(*referred, parameter.unit), "at": _at_temperature(quantity, plan.texts)}
+    text = plan.texts("trend", **what, limit=quantity_text(crossing.limit, parameter.unit, digits=4))
     return Observation(key, quantity.part, severity(plan.rules, features), features, text)
 
 
@@ -342,7 +362,8 @@ def _of_component(
     """
     key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
     order, source = component.values.get("order"), component.input.partition("(")[0]
-    is_of = {"subject": component.site, "family": component.family, "input": source}
+    unit = plan.sites.get(component.site, MonitoredQuantity()).unit
+    is_of = {"subject": component.site, "unit": unit, "family": component.family, "input": source}
     number, reach = (order.value, QUANTILE * order.sd) if order else (None, 0.0)
     features = FindingFeatures(FindingKind.COMPONENT, twin, **is_of, order=number, order_reach=reach)
     quantity = plan.sites.get(component.site, MonitoredQuantity())
@@ -350,7 +371,7 @@ def _of_component(
     is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING
     if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
         level, limit = quantity.level(size, amplitude.sd, *_held(key, before, past))
-    elif size > QUANTILE * amplitude.sd and not is_expected:
+    elif size > INSIGNIFICANT * amplitude.sd and not is_expected:
         level = severity(plan.rules, features)
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
     beside = f", {_beside(limit, size, amplitude.unit, plan.texts)}" if limit else ""

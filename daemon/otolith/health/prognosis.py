@@ -1,15 +1,18 @@
 """When a parameter passes its limits, from the history of its estimates.
 
 Three models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
-Line and exponential begin at an unknown onset:
+Line and exponential begin at an unknown onset. A fourth model is a line that has ended, as a repair, a step, or a ramp
+whose cause is over. Its end is unknown, and it is constant from there on:
 
-    value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(now - onset), 0 before the onset
+    value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(end - onset), 0 before the onset
+
+``end`` is now where the change goes on. Where it has probably ended, only what came after that change counts.
 
 Errors of consecutive estimates are correlated, because what the twin lacks lasts for several windows. They are
 an Ornstein-Uhlenbeck process of unknown time constant, whose variance is that of the estimates times an unknown factor.
 For given onset, ``x`` and time constant this is a linear regression with a conjugate prior (C. M. Bishop, Pattern
 Recognition and Machine Learning, section 3.5). These three are summed over a grid, which is refined where the evidence
-is, so that a forecast is the average over all models by their evidence.
+is, so that a forecast is the average over all models that go on, by their evidence.
 
 The baseline is the begin of that history: the values while the machine was healthy, to which relative limits refer.
 
@@ -20,10 +23,11 @@ never led, and it is over only after a day without it.
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
 from otolith.estimation.information import QUANTILE
@@ -37,13 +41,17 @@ REFIT = 0.02  # of the span of a history: how much longer it must be for another
 MIN_POINTS = 20  # of a history, for a forecast
 VAGUE, VAGUE_SHARE = 3.0, 0.1  # times the interval of most estimates, and share of the value, beyond which one is vague
 MAX_BASELINE_SHARE = 0.5  # of a baseline that its 95 % interval may have
-MIN_POINTS_AFTER = 10  # of a history after an onset
+MIN_POINTS_AFTER = 10  # of a history after an onset, for a forecast
 MIN_TREND_PROBABILITY = 0.99  # of a trend, for a forecast
 MIN_CHANGE = 0.1  # of the distance to a limit that a trend must have covered, for a forecast
 HORIZON = 10.0  # spans of the history after now: no forecast beyond
 COVERAGE = 0.8  # probability of the interval of a forecast
 GROWTH = (-6.0, 8.0)  # lowest and highest exponent of an exponential between its onset and now
-GRID = 13, 15, 10  # points of onset, exponent and time constant
+MIN_GOING_ON = 0.2  # probability that a trend has not ended, for a forecast of where it leads if it goes on
+CHANGES = 4  # that have ended, after which a history is one of changes, and has no forecast
+MIN_LENGTH = 1e-6  # of a history: length of a sudden change
+ENDED = "the last change has ended"
+GRID = 13, 15, 10  # points of onset, exponent or end, and time constant
 REFINEMENTS = 9  # of the grid, at most
 REFINED = 0.2  # of the points of a grid: how many must have weight so that it is not refined any more
 MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, from which on it counts
@@ -70,12 +78,32 @@ class Crossing:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Shapes:
+    """Changes of a history; (cells,) each."""
+
+    onset: Array  # Service time, s
+    exponent: Array  # 0 for a line
+    end: Array  # Service time, s, from which on it is constant; infinite for one that goes on
+
+    def at(self, times: Array, now: float) -> Array:
+        """Return φ of the module's docstring, (cells, times)."""
+        onset, has_ended = self.onset[:, None], np.isfinite(self.end)[:, None]
+        s = np.maximum(times[None, :] - onset, 0.0) / (np.where(has_ended, self.end[:, None], now) - onset)
+        s = np.where(has_ended, np.minimum(s, 1.0), s)
+        x = np.where(np.abs(self.exponent) < 1e-6, 1e-6, self.exponent)[:, None]  # the limit is the line
+        return np.asarray(np.expm1(np.minimum(x * s, 300.0)) / np.expm1(x))  # its square is still a number
+
+    def rows(self, which: NDArray[np.int64]) -> "_Shapes":
+        """Return some of them, by their indices."""
+        return _Shapes(self.onset[which], self.exponent[which], self.end[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Cells:
     """Grid points with their posterior; one row each."""
 
     log_weight: Array
-    onset: Array
-    exponent: Array  # 0 for a line
+    shapes: "_Shapes"
     mean: Array  # (cells, 2) constant and change until now
     covariance: Array  # (cells, 2, 2)
 
@@ -126,7 +154,7 @@ class Trend:
     def _beyond(self, weight: Array, limit: float, seconds: float, *, is_lower: bool) -> float:
         """Return the probability that the value is beyond ``limit`` after ``seconds``."""
         cells = self.cells
-        shape = _shape(np.array([self.now + seconds]), cells.onset, self.now, cells.exponent)[:, 0]
+        shape = cells.shapes.at(np.array([self.now + seconds]), self.now)[:, 0]
         mean = cells.mean[:, 0] + cells.mean[:, 1] * shape
         covariance = cells.covariance
         variance = covariance[:, 0, 0] + 2.0 * shape * covariance[:, 0, 1] + shape**2 * covariance[:, 1, 1]
@@ -167,15 +195,23 @@ def find_trend(history: History, change: float) -> Trend | str:
     """Return the trend of a history, or why there is none; ``change`` is the standard deviation of its prior."""
     if len(history) < MIN_POINTS:
         return f"too short: {len(history)} of {MIN_POINTS} estimates"
-    data = _Data.of(history, change)
-    constant = _cells(data, np.zeros(1), np.zeros(1), is_constant=True)
-    families = {"linear": _refined(data, (0.0, 0.0)), "exponential": _refined(data, GROWTH)}
-    evidence = {name: _log_sum(cells.log_weight) for name, cells in families.items()}
-    total = _log_sum(np.array([_log_sum(constant.log_weight), *evidence.values()]))
-    if 1.0 - math.exp(_log_sum(constant.log_weight) - total) < MIN_TREND_PROBABILITY:
-        return "no trend"
-    family = max(evidence, key=lambda name: evidence[name])
-    return Trend(family, history[-1][0], span(history), _together(*families.values()))
+    for _ in range(CHANGES):
+        data = _Data.of(history, change)
+        constant = _cells(data, _line(data, np.zeros((1, 2))), is_constant=True)
+        going = {"linear": _refined(data, _line), "exponential": _refined(data, _exponential)}
+        ended = _refined(data, _ended_line)
+        evidence = {name: _log_sum(cells.log_weight) for name, cells in going.items()}
+        of_constant, of_ended = (_log_sum(cells.log_weight) for cells in (constant, ended))
+        total = _log_sum(np.array([of_constant, of_ended, *evidence.values()]))
+        if 1.0 - math.exp(of_constant - total) < MIN_TREND_PROBABILITY:
+            return "no trend"
+        if of_ended - total < math.log(1.0 - MIN_GOING_ON):
+            family = max(evidence, key=lambda name: evidence[name])
+            return Trend(family, history[-1][0], span(history), _together(*going.values()))
+        history = tuple(point for point in history if point[0] > ended.shapes.end[np.argmax(ended.log_weight)])
+        if len(history) < MIN_POINTS:
+            return ENDED
+    return ENDED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,6 +234,10 @@ class _Data:
         factors, correlation = errors_of_means(gaps / shortest, np.exp(-shortest / constants))
         deviations, origin = np.sqrt(factors * variances), float(values[-1])
         return cls(times, origin, values - origin, deviations, change, correlation, 1.0 - correlation**2)
+
+    def time_at(self, share: Array, *, after: int) -> Array:
+        """Return the times at a share of the points but the last ones ``after`` them."""
+        return np.interp(share * (len(self.times) - 1.0 - after), np.arange(len(self.times)), self.times)
 
     def whitened(self, rows: Array) -> Array:
         """Return (rows, points) for each time constant: (time constants, rows, points) with independent errors."""
@@ -222,41 +262,35 @@ def errors_of_means(gaps: Array, rho: Array) -> tuple[Array, Array]:
 
 def _together(*families: _Cells) -> _Cells:
     """Return the grid points of all families that have weight; the sum of their weights is 1."""
-    onset, exponent, mean, covariance = (
-        np.concatenate([getattr(cells, name) for cells in families])
-        for name in ("onset", "exponent", "mean", "covariance")
+    log_weight, mean, covariance = (
+        np.concatenate([getattr(cells, name) for cells in families]) for name in ("log_weight", "mean", "covariance")
     )
-    log_weight = np.concatenate([cells.log_weight for cells in families])
-    kept = _Cells(log_weight - _log_sum(log_weight), onset, exponent, mean, covariance).heavy
-    log_weight = log_weight[kept] - _log_sum(log_weight[kept])
-    return _Cells(log_weight, onset[kept], exponent[kept], mean[kept], covariance[kept])
+    shapes = _Shapes(
+        *(np.concatenate([getattr(cells.shapes, name) for cells in families]) for name in ("onset", "exponent", "end"))
+    )
+    heavy = np.flatnonzero(_Cells(log_weight, shapes, mean, covariance).heavy)
+    log_weight = log_weight[heavy] - _log_sum(log_weight[heavy])
+    return _Cells(log_weight, shapes.rows(heavy), mean[heavy], covariance[heavy])
 
 
-def _shape(times: Array, onset: Array, now: float, exponent: Array) -> Array:
-    """Return φ of the module's docstring, (cells, times)."""
-    s = np.maximum(times[None, :] - onset[:, None], 0.0) / (now - onset[:, None])
-    x = np.where(np.abs(exponent) < 1e-6, 1e-6, exponent)[:, None]  # the limit is the line
-    return np.asarray(np.expm1(np.minimum(x * s, 300.0)) / np.expm1(x))  # its square is still a number
-
-
-def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = False) -> _Cells:
-    """Return the posterior at each pair of onset and exponent and each time constant, with its evidence.
+def _cells(data: _Data, changes: _Shapes, *, is_constant: bool = False) -> _Cells:
+    """Return the posterior at each of the ``changes`` and each time constant, with its evidence.
 
     The evidence lacks factors that are the same for all models of a history.
     """
-    shapes = _shape(data.times, onset, data.times[-1], exponent)
-    count, points = len(onset), len(data.times)
-    rows = data.whitened(np.concatenate([np.ones((1, points)), data.values[None, :], shapes]))
-    ones, values, shapes = rows[:, :1], rows[:, 1:2], rows[:, 2:]
+    curves = changes.at(data.times, data.times[-1])
+    count, points = curves.shape
+    rows = data.whitened(np.concatenate([np.ones((1, points)), data.values[None, :], curves]))
+    ones, values, curves = rows[:, :1], rows[:, 1:2], rows[:, 2:]
     prior = np.diag([(UNKNOWN_CONSTANT * data.change) ** -2.0, data.change**-2.0])
     if is_constant:
-        shapes = np.zeros_like(shapes)
+        curves = np.zeros_like(curves)
     precision = np.empty((len(rows), count, 2, 2))
     precision[..., 0, 0] = (ones * ones).sum(2)
-    precision[..., 0, 1] = precision[..., 1, 0] = (ones * shapes).sum(2)
-    precision[..., 1, 1] = (shapes * shapes).sum(2)
+    precision[..., 0, 1] = precision[..., 1, 0] = (ones * curves).sum(2)
+    precision[..., 1, 1] = (curves * curves).sum(2)
     precision += prior
-    moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (shapes * values).sum(2)], axis=2)
+    moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (curves * values).sum(2)], axis=2)
     covariance = np.linalg.inv(precision)
     mean = np.einsum("tcij,tcj->tci", covariance, moment)
     residual = (values * values).sum(2) - (mean * moment).sum(2)
@@ -267,25 +301,43 @@ def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = Fa
     log_weight -= math.log(log_weight.size)
     covariance = covariance * (scale / (order - 1.0))[..., None, None]
     mean[..., 0] += data.origin
-    onset, exponent = (np.tile(each, len(rows)) for each in (onset, exponent))
-    return _Cells(log_weight.ravel(), onset, exponent, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))
+    shapes = changes.rows(np.tile(np.arange(count), len(rows)))
+    return _Cells(log_weight.ravel(), shapes, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))
 
 
-def _refined(data: _Data, growth: tuple[float, float]) -> _Cells:
+def _line(data: _Data, place: Array) -> _Shapes:
+    """Return lines that go on, by the place (lines, 2) of their onset among the points, in shares of their number."""
+    return _Shapes(
+        data.time_at(place[:, 0], after=MIN_POINTS_AFTER), np.zeros(len(place)), np.full(len(place), math.inf)
+    )
+
+
+def _exponential(data: _Data, place: Array) -> _Shapes:
+    """Return exponentials that go on, by onset and exponent (exponentials, 2) in shares of their ranges."""
+    exponent = GROWTH[0] + (GROWTH[1] - GROWTH[0]) * place[:, 1]
+    return _Shapes(data.time_at(place[:, 0], after=MIN_POINTS_AFTER), exponent, np.full(len(place), math.inf))
+
+
+def _ended_line(data: _Data, place: Array) -> _Shapes:
+    """Return lines that have ended, by onset and the share (lines, 2) of the time after it that they took."""
+    onset = data.time_at(place[:, 0], after=1)
+    shortest = MIN_LENGTH * (data.times[-1] - data.times[0])
+    return _Shapes(onset, np.zeros(len(place)), onset + np.maximum(place[:, 1] * (data.times[-1] - onset), shortest))
+
+
+def _refined(data: _Data, family: Callable[[_Data, Array], _Shapes]) -> _Cells:
     """Return the grid points of a family, on a grid that is refined around the best of them.
 
     Onsets and exponents that fit equally well lie on a narrow ridge: each grid is aligned with the best points before.
     """
-    points = len(data.times)
-    low, whole = np.array([0.0, growth[0]]), np.array([points - MIN_POINTS_AFTER - 1.0, growth[1] - growth[0]])
+    whole = np.array([1.0, 0.0 if family is _line else 1.0])
     numbers = GRID[:2] if whole[1] > 0.0 else (GRID[0], 1)
     steps = np.indices(numbers).reshape(2, -1).T
     axes, begin, spacing = np.eye(2), np.zeros(2), (whole > 0.0) / np.maximum(np.subtract(numbers, 1), 1)
     for number in range(REFINEMENTS + 1):
         place = (begin + spacing * steps) @ axes  # in shares of the whole
         place = place[(np.abs(place - 0.5) <= 0.5 + 1e-9).all(1)]
-        index, exponent = (low + whole * place).T
-        cells = _cells(data, np.interp(index, np.arange(points), data.times), exponent)
+        cells = _cells(data, family(data, place))
         cells.log_weight[:] += math.log(len(place) * np.prod((spacing * numbers)[whole > 0.0]) / len(steps))
         best = cells.log_weight.reshape(-1, len(place)).max(0)
         heavy = int((best > best.max() + math.log(MIN_WEIGHT)).sum())
@@ -326,8 +378,14 @@ def forecast(quantity: MonitoredQuantity, history: History) -> ForecastDocument:
 
 
 def is_due(before: ForecastDocument | None, history: History) -> bool:
-    """Whether a history has grown so much since the forecast ``before`` that it is fitted again."""
-    return before is None or not 0.0 <= history[-1][0] - before.computed < REFIT * span(history)
+    """Whether a history has grown so much since the forecast ``before`` that it is fitted again.
+
+    A trend that leads to a limit may have ended: after a few more estimates it is fitted again, in a long history too.
+    """
+    if before is None or not 0.0 <= history[-1][0] - before.computed < REFIT * span(history):
+        return True
+    leads = before.watch is not None or before.act is not None
+    return leads and sum(time > before.computed for time, _, _ in history[-MIN_POINTS_AFTER:]) >= MIN_POINTS_AFTER
 
 
 @dataclass(frozen=True, slots=True)

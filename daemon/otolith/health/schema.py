@@ -107,6 +107,9 @@ class FindingDocument(DocumentModel):
     condition: str
     text: str
     since: float  # Unix seconds
+    error: float | None = None
+    """Of a sensor, its error over the size of its signal; of a late signal, its delay in s, negative for an early one.
+    """
     advice: str = ""
     setting: str = ""  # What to write into the machine file if it is wrong and the machine is not; for the specialist
     of_file: bool = False  # Whether it shows that the machine file is wrong, whatever happens to the machine

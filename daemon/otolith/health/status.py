@@ -98,7 +98,7 @@ def publish(
         value=value if shown else None,
         unit=parameter.unit,
         sd=known_now.sd if shown else None,
-        low=value - reach if shown else None,
+        low=max(value - reach, 0.0 if parameter.low >= 0.0 else -math.inf) if shown else None,
         high=value + reach if shown else None,
         nominal=parameter.nominal,
         raw=None if alone is None else alone.value,

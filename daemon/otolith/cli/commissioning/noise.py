@@ -316,7 +316,8 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
 
 def _row(level: "NoiseLevel", unit: str) -> tuple[str, str, str]:
     """A key of the machine file with its value, and its comment."""
-    uncertainty = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
+    is_known = level.sd is not None and level.value and not level.is_bound
+    uncertainty = f"± {level.sd / level.value:.1%}" if level.sd is not None and is_known else ""
     return level.name, f"{level.value:.3g} {unit}", "; ".join(filter(None, [uncertainty, level.remark]))
 
 
