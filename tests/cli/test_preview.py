@@ -1,6 +1,7 @@
 """The preview of a recording: properties of a generated file are printed; short files and slow cores are named."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +17,21 @@ from otolith.runtime.preview import Preview, preview_lines, preview_recording, s
 from otolith.runtime.replay import open_recordings
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Reader
+from tests.adaptation.test_parameters_at_bounds import MACHINE as SERVO_MACHINE
+from tests.adaptation.test_parameters_at_bounds import TWIN as SERVO_TWIN
 from tests.cli.replays import MACHINE, Lines, recorded, written
 from tests.messages import assert_says
+
+SERVO = SERVO_TWIN.replace("[1e-5, 1e-4]", "[1e-5, 2e-3]").replace("[5e-5, 2e-4]", "[5e-5, 2e-3]").replace(
+    "nominal = 1e-4", "nominal = 2e-4").replace("nominal = 5e-5", "nominal = 4e-4")  # fmt: skip
+SERVO_SIGNALS = """
+[driver]
+type = "replay"
+file = "data.csv"
+[signals]
+T = { column = "T", unit = "N*m" }
+w = { column = "w", unit = "rad/s" }
+"""
 
 
 @pytest.fixture
@@ -141,6 +155,28 @@ def test_a_window_that_is_too_short_for_its_noise_gets_a_longer_one(tmp_path: Pa
     assert lines[start + 1] == "  [window]"
     pasted = "\n".join(line.strip() for line in lines[start + 2 : start + 4])
     assert previewed(tmp_path / "data.csv", pasted).windows.length_s == preview.proposed.length_s
+
+
+def test_a_window_that_trades_its_parameters_gets_one_that_holds_the_step(tmp_path: Path) -> None:
+    """A servo whose torque steps every 20 s: in 2 s at one speed viscous and dry friction are traded."""
+    (tmp_path / "servo.toml").write_text(SERVO, encoding="utf-8")
+    text = SERVO_MACHINE.replace('length = "5 s"', 'length = "2 s"') + SERVO_SIGNALS
+    (tmp_path / "m.toml").write_text(text, encoding="utf-8")
+    random, speed, lines = np.random.default_rng(1), 0.0, ["t,T,w"]
+    for index in range(20_000):
+        torque = (0.1, 0.06, -0.08)[(index + 900) // 2000 % 3]
+        lines.append(f"{0.01 * index:.2f},{torque},{speed + 0.5 * random.normal():.4f}")
+        for _ in range(10):
+            speed += 1e-3 * (torque - 4e-4 * speed - 0.0366 * math.tanh(speed / 2.0)) / 2e-4
+    data = tmp_path / "data.csv"
+    data.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    preview = preview_recording(load_machine(tmp_path / "m.toml", with_driver=False), [data])
+    assert any(2 * accuracy.determined < preview.windows.analysed for accuracy in preview.windows.parameters.values())
+    proposed = preview.proposed
+    assert 2.0 < proposed.length_s <= 30.0
+    assert all(2 * accuracy.determined >= proposed.analysed for accuracy in proposed.parameters.values())
+    (line,) = [remark for remark in preview.remarks if "would bring" in remark]
+    assert_says(line, "T_c", "instead of")
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])

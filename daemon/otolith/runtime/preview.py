@@ -38,6 +38,8 @@ TIMING_BUDGET = 20.0  # s of computing, after which no further window is timed
 MIN_MOTION = 12.0  # standard deviations of the noise: range of an output that moves in a window
 MAX_PERIOD_ERROR = 0.02  # share by which the sample period may differ from the interval of the fastest signal
 MAX_LENGTHENING = 10.0  # times the length of a window: a parameter that needs more needs another experiment
+MAX_TRIED, LENGTH_FACTOR = 4, 1.5  # longer windows that are tried, each by this factor at least
+MAX_TRIED_LENGTH = 600.0  # s: that of the longest window
 MIN_PROPOSED_WINDOWS = 3  # windows of the proposed length that the recording has at least
 MIN_REMARKED_JITTER = 0.5  # of the interval: a larger jitter is remarked
 MIN_LEVELS = 20  # different values of a signal, below which the ends of its range are steps of its converter
@@ -157,9 +159,9 @@ def preview_recording(
         ConfigurationError: the file cannot be read as the signals of the twin.
     """
     survey = _survey(machine, data, stopped, max_rows, progress)
-    proposed, seconds = survey, list[float]()
+    proposed, longer, seconds = survey, "", list[float]()
     if max_rows is None:
-        proposed = _proposal(machine, survey, lambda other: _survey(other, data, stopped, None, progress))
+        proposed, longer = _proposal(machine, survey, lambda other: _survey(other, data, stopped, None, progress))
         progress("measuring the computing time of windows")
         seconds = _computing_seconds(proposed.machine, proposed.chosen)
     statistics = survey.statistics
@@ -181,6 +183,7 @@ def preview_recording(
             *survey.warnings,
             *_remarks(survey.plans, statistics, samplings),
             *_sensor_remarks(machine, survey.chosen),
+            *filter(None, [longer]),
         ),
     )
 
@@ -198,8 +201,64 @@ class _Survey:
     chosen: list[Window]  # The windows that were analysed
 
 
-def _proposal(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMachine], _Survey]) -> _Survey:
-    """Return the survey of a window that fits the data better, made by ``again``; ``survey`` if there is none."""
+def _proposal(
+    machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMachine], _Survey]
+) -> tuple[_Survey, str]:
+    """Return the survey of a window that fits the data better, made by ``again``, and what a longer one would bring.
+
+    If no length is better, the survey is ``survey``. Parameters that a window trades with each other may become
+    separable in a longer one, which holds a step of the inputs: then lengths are tried, and the shortest that
+    determines most parameters is taken.
+    """
+    best = _better_window(machine, survey, again)
+    if _separable(best) == len(machine.problem.free) or not best.windows.moving:
+        return best, ""
+    statistics, period = survey.statistics, best.windows.sample_period_s
+    longest = min(max(statistics.last - statistics.first, 0.0) / MIN_PROPOSED_WINDOWS, MAX_TRIED_LENGTH)
+    length, latest = best.windows.length_s, best
+    for _ in range(MAX_TRIED):
+        length = whole_length(_nice_above(LENGTH_FACTOR * length), period)
+        if length > longest:
+            break
+        latest = again(_with_window(machine, length, period))
+        if _separable(latest) > _separable(best):
+            best = latest
+            if _separable(best) == len(machine.problem.free):
+                break
+    following = whole_length(_nice_above(LENGTH_FACTOR * best.windows.length_s), period)
+    if best is survey or latest is not best or following > longest:
+        return best, "" if latest is best else _longer(best, latest)
+    return best, _longer(best, again(_with_window(machine, following, period)))
+
+
+def _separable(survey: _Survey) -> int:
+    """Return how many parameters half of the analysed windows determine within what is asked."""
+    windows = survey.windows
+    return sum(2 * accuracy.determined >= max(windows.analysed, 1) for accuracy in windows.parameters.values())
+
+
+def _nice_above(wanted: float) -> float:
+    """Return the least of 1, 2 and 5 times a power of ten that is not below ``wanted``."""
+    digit = 10.0 ** math.floor(math.log10(wanted))
+    return next(factor * digit for factor in (1.0, 2.0, 5.0, 10.0) if factor * digit >= wanted * (1.0 - 1e-9))
+
+
+def _longer(best: _Survey, longer: _Survey) -> str:
+    """Return what the windows of ``longer`` determine, beside those of ``best``."""
+    parts = []
+    for name, accuracy in longer.windows.parameters.items():
+        here = best.windows.parameters[name].half_width
+        unit = unit_text(accuracy.unit)
+        now, then = (
+            "undetermined" if width is None else f"±{width:.2g} {unit}".rstrip()
+            for width in (here, accuracy.half_width)
+        )
+        parts.append(f"{name} {then} instead of {now}")
+    return f"a window of {longer.windows.length_s:g} s would bring: {', '.join(parts)}"
+
+
+def _better_window(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMachine], _Survey]) -> _Survey:
+    """Return the survey of a window whose period and length fit the accuracy that is asked; ``survey`` without one."""
     statistics, window = survey.statistics, machine.file.window
     period = _proposed_period(statistics, window.sample_period)
     length = _proposed_length(survey.windows, max(statistics.last - statistics.first, 0.0), period)
@@ -327,9 +386,7 @@ def _proposed_length(windows: WindowPreview, duration: float, period: float) -> 
     wanted = max((factor for factor in factors if factor <= MAX_LENGTHENING), default=1.0) * windows.length_s
     if wanted <= windows.length_s or wanted > longest:
         return whole_length(windows.length_s, period)
-    digit = 10.0 ** math.floor(math.log10(wanted))
-    nice = next(factor * digit for factor in (1.0, 2.0, 5.0, 10.0) if factor * digit >= wanted)
-    return whole_length(min(nice, longest, 600.0), period)
+    return whole_length(min(_nice_above(wanted), longest, MAX_TRIED_LENGTH), period)
 
 
 def _with_window(machine: LoadedMachine, length: float, period: float) -> LoadedMachine:
