@@ -271,7 +271,7 @@ def test_the_short_preview_reads_only_the_beginning(
     assert_says(lines[-1], "not examined", "window", "computing time", "'otolith check'")
 
 
-def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_short(
+def test_the_data_are_read_once_and_again_for_each_window_that_is_tried_unless_the_preview_is_short(
     tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[Path] = []
@@ -292,7 +292,8 @@ def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_s
         preview = previewed(data, window, max_rows)
         counts.append((len(opened), preview.proposed != preview.windows))
         opened.clear()
-    assert counts == [(1, False), (2, True), (2, True), (1, False)]
+    # In 0.5 s and 1 s the damping is far from what is asked, so 2 s are tried as well.
+    assert counts == [(1, False), (3, True), (2, True), (1, False)]
 
 
 @pytest.mark.parametrize(("end", "kind"), [(1.0, "largest"), pytest.param(-1.0, "smallest", marks=pytest.mark.full)])

@@ -152,8 +152,8 @@ def preview_recording(
 ) -> Preview:
     """Return the preview of ``data``: of its first ``max_rows`` rows, without a proposal and computing times, if given.
 
-    Each file is a recording of its own. It is read once, and again for a proposed window. ``progress`` is called from
-    time to time with a text.
+    Each file is a recording of its own. It is read once, and again for each other window that is tried. ``progress``
+    is called from time to time with a text.
 
     Raises:
         ConfigurationError: the file cannot be read as the signals of the twin.
@@ -211,7 +211,7 @@ def _proposal(
     determines most parameters is taken.
     """
     best = _better_window(machine, survey, again)
-    if _separable(best) == len(machine.problem.free) or not best.windows.moving:
+    if not best.windows.moving or not any(map(_is_traded, best.windows.parameters.values())):
         return best, ""
     statistics, period = survey.statistics, best.windows.sample_period_s
     longest = min(max(statistics.last - statistics.first, 0.0) / MIN_PROPOSED_WINDOWS, MAX_TRIED_LENGTH)
@@ -229,6 +229,11 @@ def _proposal(
     if best is survey or latest is not best or following > longest:
         return best, "" if latest is best else _longer(best, latest)
     return best, _longer(best, again(_with_window(machine, following, period)))
+
+
+def _is_traded(accuracy: ExpectedAccuracy) -> bool:
+    """Whether the usual window leaves a parameter so wide that more of the same records would not determine it."""
+    return accuracy.half_width is None or (accuracy.half_width / accuracy.required) ** 2 > MAX_LENGTHENING
 
 
 def _separable(survey: _Survey) -> int:
