@@ -21,7 +21,7 @@ from otolith.adaptation.state import (
     with_records,
 )
 from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO
-from otolith.discovery.alternatives import DATA_FAULTS, PosteriorUpdate, WindowDecision
+from otolith.discovery.alternatives import DATA_FAULTS, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import (
     MAX_COST,
     AdoptedComponent,
@@ -88,8 +88,19 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if shortened:  # reports come as often as whole windows
         document = document.model_copy(update={"window": window_document(window)})
     health, document = assess(state.plan, state.health, document)
-    ledger = ledger.kept_after(result.decision, state.ledger)
+    ledger = _kept(ledger, result.decision, state.ledger)
     return _next_state(state, result, ledger, previous, health), replace(report, document=document)
+
+
+def _kept(ledger: Ledger, decision: WindowDecision, before: Ledger) -> Ledger:
+    """Return what remains of the ledger after a window that led to ``decision``; ``before`` is without the window.
+
+    A posterior that replaces the filter's contains what earlier windows have shown. The sums of the noise of inputs end
+    only with accepted noise. The error of a sensor shifts no parameter.
+    """
+    if UPDATES[decision] is PosteriorUpdate.HYPOTHESIS:
+        return Ledger() if decision is WindowDecision.NOISIER else Ledger(input_noise=ledger.input_noise)
+    return replace(ledger, cusum=before.cusum) if decision in DATA_FAULTS else ledger
 
 
 def _predict_and_check(state: AdaptationState, window: Window) -> tuple[AdaptationState, Posterior, CheckedWindow]:
@@ -97,10 +108,13 @@ def _predict_and_check(state: AdaptationState, window: Window) -> tuple[Adaptati
 
     If the data are faulty, the state keeps its steps: differences between faulty values are none of a converter.
     """
-    state = with_posterior(state, state.posterior.without_expired(window.start))
-    if commands := state.problem.changing:
-        window = with_changes_between(window, commands)
-    problem, predicted = state.problem, state.posterior.with_steps(window).predict(window)
+    posterior = state.posterior.without_expired(window.start)
+    if posterior is not state.posterior:
+        state = with_posterior(state, posterior)
+    problem = posterior.problem
+    if problem.changing:
+        window = with_changes_between(window, problem.changing)
+    predicted = posterior.with_steps(window).predict(window)
     checked = check_window(window, predicted)
     if predicted.problem is problem:
         return state, predicted, checked

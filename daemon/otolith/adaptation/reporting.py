@@ -29,7 +29,7 @@ from otolith.discovery.experiment_design import Situation, advise, deciding_expe
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.data_checks import FaultySensor
-from otolith.estimation.information import QUANTILE, Prior
+from otolith.estimation.information import QUANTILE, Prior, required_half_widths
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of, wrapped
 from otolith.estimation.window_fit import WindowEstimate
@@ -191,9 +191,9 @@ def _parameters(
     documents: dict[str, ParameterDocument] = {}
     previous: dict[str, PreviousStatus] = {}
     count = len(problem.free)
-    required = problem.required_for(result.after.mean[:count])
+    required = required_half_widths(problem, result.after.mean[:count])
     if result.is_mixture:  # a change that is not accepted yet allows no less accuracy than the value before it
-        required = np.minimum(required, problem.required_for(result.posterior.prior().mean[:count]))
+        required = np.minimum(required, required_half_widths(problem, result.posterior.prior().mean[:count]))
     contradictions = result.contradictions(state)
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):

@@ -7,7 +7,6 @@ import numpy as np
 
 from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows, Structure
-from otolith.discovery.alternatives import DATA_FAULTS, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum
@@ -37,16 +36,6 @@ class Ledger:
     """The last windows that the twin explained, which are searched together."""
     input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
     """What windows show of the noise of inputs for which none is stated."""
-
-    def kept_after(self, decision: WindowDecision, before: "Ledger") -> "Ledger":
-        """Return what remains of the ledger after a window that led to ``decision``; ``before`` is without the window.
-
-        A posterior that replaces the filter's contains what earlier windows have shown. The sums of the noise of inputs
-        end only with accepted noise. The error of a sensor shifts no parameter.
-        """
-        if UPDATES[decision] is PosteriorUpdate.HYPOTHESIS:
-            return Ledger() if decision is WindowDecision.NOISIER else Ledger(input_noise=self.input_noise)
-        return replace(self, cusum=before.cusum) if decision in DATA_FAULTS else self
 
 
 @dataclass(frozen=True, slots=True, eq=False)

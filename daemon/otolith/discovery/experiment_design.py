@@ -17,7 +17,7 @@ from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.discovery.linear_response import chi_square_of_parameters
 from otolith.discovery.screening import linearised
 from otolith.estimation.evidence import DECISIVE
-from otolith.estimation.information import QUANTILE, Prior, information
+from otolith.estimation.information import QUANTILE, Prior, information, required_half_widths
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import shifted
@@ -55,7 +55,7 @@ class Move:
 
 def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[str]) -> dict[str, str]:
     """Return a sentence for each ``wanted`` parameter that some move would determine, given what is ``known``."""
-    required, present = problem.required_for(known.mean[: len(problem.free)]), QUANTILE * known.sd
+    required, present = required_half_widths(problem, known.mean[: len(problem.free)]), QUANTILE * known.sd
     best = {at: (present[at], "") for at, own in enumerate(problem.free) if own.name in wanted}
     for move in moves(problem, situation):
         searched = [at for at, (reach, _) in best.items() if reach > required[at]]

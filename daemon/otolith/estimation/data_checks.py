@@ -117,7 +117,7 @@ def check_window(window: Window, predicted: Posterior) -> CheckedWindow:
         return CheckedWindow(cleaned, faulty_sensors=tuple(faulty))
     cleaned, repeated = drop_repeats(cleaned, problem.base_model, _channels(problem, Check.STALE))
     held = frozenset(name for name, sensor in problem.sensors if sensor.holds)
-    return CheckedWindow(new_readings(cleaned, held), (*notes, *repeated))
+    return CheckedWindow(new_readings(cleaned, held) if held else cleaned, (*notes, *repeated))
 
 
 def _channels(problem: Problem, check: Check) -> frozenset[str]:

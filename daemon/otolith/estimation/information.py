@@ -205,6 +205,17 @@ class AccuracyTarget:
     pressure: float = 0.0  # How far beyond the bound a further step would lead, in standard deviations
 
 
+def required_half_widths(problem: Problem, values: Array) -> Array:
+    """Return the largest half-width (free,) of the 95 % interval of determined parameters at ``values`` (free,).
+
+    It is relative to the value that was found: the nominal value may be a guess. A parameter that may be zero has a
+    size of its own, that of its nominal value, below which an interval need not be relative.
+    """
+    low, high = problem.bounds
+    found = np.clip(np.abs(values), low, high)
+    return problem.determined_within * np.where(low > 0.0, found, np.maximum(np.abs(values), problem.scale))
+
+
 def at_its_bound(value: float, unit: str) -> str:
     """Return the reason of a parameter at a bound, with the way out."""
     bound = f"{value:.4g} {unit_text(unit)}".rstrip()

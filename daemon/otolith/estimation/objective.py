@@ -334,7 +334,8 @@ def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
     outputs = [output.name for output in problem.base_model.outputs]
     values = (window.column(name)[~window.missing_in(name)] for name in outputs)
     shown = list(map(_plausible_step, values, problem.noise))
-    before = problem.steps or tuple(problem.sensor(name).resolution for name in outputs)
+    stated = {name: sensor.resolution for name, sensor in problem.sensors}
+    before = problem.steps or tuple(stated.get(name, 0.0) for name in outputs)
     steps = tuple(
         new if new and (not old or new < old * (1.0 - ADC_TOLERANCE)) else old
         for old, new in zip(before, shown, strict=True)

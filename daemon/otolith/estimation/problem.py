@@ -118,7 +118,7 @@ class Problem:
     """Standard deviation of each state per square root of a second; empty for none."""
     open_loop: bool = False  # Use the paper's cost: no innovation corrects the twin within a window
     determined_within: float = 0.1
-    """A parameter is determined when half of its 95 % interval is at most this share of its value; see required_for."""
+    """A parameter is determined when half of its 95 % interval is at most this share of its value."""
     components: tuple[Component, ...] = ()
     """Components in the twin. Their values are free parameters with names that begin with an underscore."""
     unchecked: frozenset[tuple[str, Check]] = frozenset()
@@ -150,15 +150,6 @@ class Problem:
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
-
-    def required_for(self, values: Array) -> Array:
-        """Return the largest half-width (free,) of the 95 % interval of determined parameters at ``values`` (free,).
-
-        It is relative to the value that was found: the nominal value may be a guess. A parameter that may be zero has a
-        size of its own, that of its nominal value, below which an interval need not be relative.
-        """
-        found = np.clip(np.abs(values), *self.bounds)
-        return self.determined_within * np.where(self.bounds[0] > 0.0, found, np.maximum(np.abs(values), self.scale))
 
     @property
     def levels(self) -> tuple[float, ...]:

@@ -93,7 +93,7 @@ def new_readings(window: Window, held: frozenset[str]) -> Window:
         column = window.signals.index(name)
         present = np.flatnonzero(~window.missing[:, column])
         missing[present[1:][np.diff(window.values[present, column]) == 0.0], column] = True
-    return replace(window, missing=missing) if held else window
+    return replace(window, missing=missing)
 
 
 def distance(prediction: Array, times: Array, run: NDArray[np.int64]) -> float:

@@ -29,6 +29,7 @@ from otolith.estimation.information import (
     inflation_of,
     information,
     partners,
+    required_half_widths,
     without_input_noise,
 )
 from otolith.estimation.minimisers import MAX_STEPS, FitResult, continued, gauss_newton
@@ -437,7 +438,7 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
     objective, problem, guess = both.fit.objective, both.fit.problem, both.alone.guess
     width = objective.high - objective.low
     at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
-    required = problem.required_for(both.values[: len(problem.free)])
+    required = required_half_widths(problem, both.values[: len(problem.free)])
     pressure = _pressure(both, at_bound)
     estimates = []
     for index, parameter in enumerate(problem.free):
@@ -513,4 +514,4 @@ def _determines_without(estimated: WindowEstimate) -> bool:
     objective = Objective(problem, known, parameters)
     _, jacobian = objective.linearise(objective.guess(parameters))
     sd = information(jacobian, objective.high - objective.low, 1.0).sd[: objective.free]
-    return bool((QUANTILE * sd <= problem.required_for(parameters)).any())
+    return bool((QUANTILE * sd <= required_half_widths(problem, parameters)).any())
