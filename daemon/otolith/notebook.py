@@ -111,13 +111,26 @@ class Twin:
         Raises:
             otolith_drivers.errors.ConfigurationError: the file, or what was learned, cannot be used; it says why.
         """
-        machine = load_machine(Path(path), with_driver=False)
-        names, store = machine.file.machine, store_of(machine)
-        plan = with_baselines(machine.plan, store.decisions().baselines)
-        state, reason = store.peek(initial_state(names.name, names.site, machine.problem, plan))
+        fresh = cls.fresh(path)
+        store = store_of(fresh.machine)
+        plan = with_baselines(fresh.machine.plan, store.decisions().baselines)
+        state, reason = store.peek(replace(fresh.learned, plan=plan))
         if reason:
-            raise ConfigurationError(f"{store.components_path}: cannot be used: {reason}")
-        return cls(machine, state, state.posterior, store.labels())
+            remedy = "run the daemon, or adapt the twin to a recording: Twin.fresh(...).adapted(...), or --after"
+            raise ConfigurationError(f"{store.components_path}: cannot be used: {reason}: {remedy}")
+        return cls(fresh.machine, state, state.posterior, store.labels())
+
+    @classmethod
+    def fresh(cls, path: str | Path) -> "Twin":
+        """Return the twin as the machine file at ``path`` describes it, whatever a daemon has learned.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: the file cannot be used; it says why.
+        """
+        machine = load_machine(Path(path), with_driver=False)
+        names = machine.file.machine
+        state = initial_state(names.name, names.site, machine.problem, machine.plan)
+        return cls(machine, state, state.posterior)
 
     @property
     def inputs(self) -> dict[str, str]:

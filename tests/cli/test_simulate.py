@@ -180,6 +180,17 @@ def test_without_a_state_nothing_is_predicted(tmp_path: Path) -> None:
         otolith("simulate", machine, "--inputs", machine.with_name("plan.csv"), "--until-limit")
 
 
+def test_what_cannot_be_used_any_more_does_not_matter_where_a_recording_is_adapted_to(machine: Path) -> None:
+    """As after a change of the noise in the machine file, or of a damaged file."""
+    plan, monday = machine.with_name("plan.csv"), machine.with_name("monday.csv")
+    text = machine.read_text(encoding="utf-8")
+    machine.write_text(text.replace('i = "5 mA"', 'i = "6 mA"'), encoding="utf-8")
+    with raises_saying(ConfigurationError, "noise", "--after"):
+        otolith("simulate", machine, "--inputs", plan)
+    assert_says(otolith("simulate", machine, "--inputs", plan, "--after", monday).stdout, "251 records")
+    assert "model" in otolith("twin", "export", machine, "--modelica", "--after", monday).stdout
+
+
 def test_options_that_exclude_each_other_are_a_usage_error(machine: Path) -> None:
     plan = machine.with_name("plan.csv")
     for options in ((), ("--inputs", plan, "--json", "--csv", "-"), ("--inputs", plan, "--at", "1d", "--after", plan)):

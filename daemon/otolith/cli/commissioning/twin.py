@@ -157,8 +157,7 @@ def export(file: Path, language: str | None, recordings: tuple[Path, ...], outpu
         raise click.UsageError("give --python or --modelica")
     use_state_of_service(file)
     with progress_line("exporting"):
-        adapted = Twin.load(file)
-        adapted = adapted.adapted(*recordings) if recordings else adapted
+        adapted = Twin.fresh(file).adapted(*recordings) if recordings else Twin.load(file)
         text = adapted.python() if language == "python" else adapted.modelica()
     if output is None:
         echo(*text.rstrip("\n").split("\n"))

@@ -104,7 +104,7 @@ def simulate(
 
     use_state_of_service(file)
     with progress_line("simulating", enabled=not as_json):
-        twin = Twin.load(file)
+        twin = Twin.fresh(file) if recordings else Twin.load(file)
         source = _source(twin, data, span)
         twin = twin.adapted(*recordings) if recordings else twin
         twin = twin if moment is None else twin.at(moment.before(time.time(), twin.machine.plan.timezone))
