@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.quality import is_of_calendar
-from otolith.acquisition.window import Array, Verdict, Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
@@ -35,8 +35,6 @@ from otolith.storage.history import MINUTE, RESOLUTIONS, HistoryReader, HistoryS
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.units import quantity_text
-
-MAX_LEAD = 5  # windows of a recording, one of which must be usable. docs/reference/thresholds-runtime.md
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,13 +338,9 @@ class Twin:
         if np.isfinite(end) and first.start + by < end - 0.5 * first.sample_period:
             by = end + first.grid.length - first.start
         windows = [replace(window, start=window.start + by) for window in stretch.windows]
-        for index, window in enumerate(windows[: min(MAX_LEAD, len(windows) - 1)]):
-            if window.quality.verdict is Verdict.GOOD:
-                rest = joined([window.since(window.records - 1), *windows[index + 1 :]])
-                return self._supposed_of(after_window(known, window)), rest, rest.start - by
-        reasons = [reason for window in windows[:MAX_LEAD] for reason in window.quality.reasons]
-        fault = f"none of the first {MAX_LEAD} windows can be used: {reasons[0]}"
-        raise ConfigurationError(f"{stretch.path}: {fault}: give a span that begins later")
+        lead = stretch.lead()
+        rest = joined([windows[lead].since(windows[lead].records - 1), *windows[lead + 1 :]])
+        return self._supposed_of(after_window(known, windows[lead])), rest, rest.start - by
 
     def _supposed_of(self, posterior: Posterior) -> Posterior:
         """Return a later posterior of the same machine with what a person supposes."""

@@ -26,6 +26,8 @@ from tests.messages import assert_says, raises_saying
 from tests.simulation.recorded_motor import PLAN, learned, save_learned, write_files
 from tests.storage.histories import document
 
+FILES = "monday.csv", "tuesday.csv"
+
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
@@ -79,6 +81,36 @@ def test_a_recording_is_predicted_after_its_first_window(machine: Path) -> None:
     assert np.sqrt(np.mean(deviates**2, axis=0)) == pytest.approx(1.0, abs=0.3)
     for name in predicted.outputs:
         assert 0.9 < (predicted.coverage(name) or 0.0) <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("gaps", "begin", "end"), [((200,), 6.99, 12.99), ((400,), 1.99, 3.99), ((200, 600), 6.99, 8.99)]
+)
+def test_a_recording_is_predicted_up_to_a_gap_which_is_told(
+    machine: Path, gaps: tuple[int, ...], begin: float, end: float
+) -> None:
+    """A window that no other one follows, as before the first gap, is none to begin with."""
+    monday, tuesday = (machine.with_name(name).read_text(encoding="utf-8").split() for name in FILES)
+    cells = [row.split(",") for row in (*monday[1:], *tuesday[1:])][:1000]
+    moved = [[f"{float(row[0]) + 3.0 * sum(at >= gap for gap in gaps):.3f}", *row[1:]] for at, row in enumerate(cells)]
+    data = machine.with_name("gap.csv")
+    data.write_text("\n".join([monday[0], *map(",".join, moved)]) + "\n", encoding="utf-8")
+    table = machine.with_name("out.csv")
+    told = otolith("simulate", machine, "--inputs", data, "--csv", table).stderr
+    with table.open(encoding="utf-8") as file:
+        times = [float(row["t [s]"]) for row in csv.DictReader(file)]
+    assert (times[0], times[-1]) == pytest.approx((begin, end))
+    assert ("not predicted" in told) == (end < float(moved[-1][0]) - 1.0)
+
+
+def test_an_input_that_is_missing_for_a_window_is_told(machine: Path) -> None:
+    rows = machine.with_name("tuesday.csv").read_text(encoding="utf-8").split()
+    cells = [row.split(",") for row in rows]
+    for row in cells[201:401]:
+        row[2] = ""
+    machine.with_name("tuesday.csv").write_text("\n".join(map(",".join, cells)) + "\n", encoding="utf-8")
+    told = otolith("simulate", machine, "--inputs", machine.with_name("tuesday.csv")).stderr
+    assert_says(told, "tuesday.csv", "1", "T_load", "bands")
 
 
 def test_a_recording_that_contradicts_what_was_learned_is_predicted_nevertheless(machine: Path) -> None:

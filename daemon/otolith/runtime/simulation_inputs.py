@@ -1,19 +1,23 @@
 """What drives a simulation, from a file: planned inputs, or a recording, whose outputs are compared with it."""
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.quality import time_text
+from otolith.acquisition.window import Array, Verdict, Window
 from otolith.machine import LoadedMachine
 from otolith.runtime.replay import Replay, open_by_name, open_recorded, open_span
-from otolith.simulation.plan import MAX_RECORDS
+from otolith.simulation.plan import MAX_RECORDS, follows
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import Reader, Rows, costs_a_process, holds_frames
 from otolith_drivers.replay.span import SpanReader
 
+MAX_LEAD = 5  # windows of a recording, one of which must be usable. docs/reference/thresholds-runtime.md
 COUNTS = re.compile(r"^bad cells: \d+, bad rows: \d+, the first in line (\d+): ")
 
 
@@ -34,6 +38,30 @@ class RecordedStretch:
     path: Path
     windows: tuple[Window, ...]
     warnings: tuple[str, ...] = ()
+
+    def lead(self) -> int:
+        """Return the number of the first window that can show the state of the machine: another one follows it.
+
+        Raises:
+            ConfigurationError: none of the first :data:`MAX_LEAD` can.
+        """
+        found = _lead(self.windows)
+        if found is None:
+            reasons = [reason for window in self.windows[:MAX_LEAD] for reason in window.quality.reasons]
+            reason = reasons[0] if reasons else "behind each is a gap"
+            fault = f"none of the first {MAX_LEAD} windows can be used: {reason}"
+            raise ConfigurationError(f"{self.path}: {fault}: give a span that begins later")
+        return found
+
+
+def _lead(windows: Sequence[Window]) -> int | None:
+    """See :meth:`RecordedStretch.lead`."""
+    usable = (
+        index
+        for index, (window, after) in enumerate(pairwise(windows[: MAX_LEAD + 1]))
+        if window.quality.verdict is Verdict.GOOD and follows(after, window)
+    )
+    return next(usable, None)
 
 
 def read_inputs(
@@ -117,4 +145,18 @@ def _recorded(machine: LoadedMachine, reader: Reader) -> RecordedStretch:
         length = f"{machine.file.window.length:g} s"
         needed = f"two windows of {length} are needed, the first of which shows the state of the machine"
         raise ConfigurationError(f"{reader.path}: {len(windows)} windows: {needed}: give a longer span or recording")
-    return RecordedStretch(reader.path, tuple(windows), tuple(replay.warnings()))
+    return RecordedStretch(reader.path, tuple(windows), (*replay.warnings(), *_remarks(windows)))
+
+
+def _remarks(windows: Sequence[Window]) -> Iterator[str]:
+    """Yield what of the ``windows`` is not predicted, or from inputs that are not known."""
+    begin = (_lead(windows) or 0) + 1
+    gaps = (index for index in range(begin, len(windows)) if not follows(windows[index], windows[index - 1]))
+    end = next(gaps, len(windows))
+    if end < len(windows):
+        gap = f"a gap from {time_text(windows[end - 1].end)} to {time_text(windows[end].start)}"
+        yield f"{gap}: what is after it is not predicted: give a span that begins there"
+    bad = [window for window in windows[begin:end] if window.quality.verdict is not Verdict.GOOD]
+    if bad:
+        first = f"the first from {time_text(bad[0].start)}: {'; '.join(bad[0].quality.reasons)}"
+        yield f"windows with data that cannot be used: {len(bad)}, {first}; bands do not contain errors of its inputs"

@@ -54,11 +54,16 @@ def _grid(offsets: Array, period: float) -> TimeGrid:
     return TimeGrid.at(offsets, float(offsets[-1]) + period)
 
 
+def follows(window: Window, before: Window) -> bool:
+    """Whether there is no gap between a window and the one before."""
+    return abs(window.start - before.end) <= 0.5 * window.sample_period
+
+
 def joined(windows: Sequence[Window]) -> Window:
     """Return windows that follow one another as one; those after the first gap are left out."""
     kept = [windows[0]]
     for window in windows[1:]:
-        if abs(window.start - kept[-1].end) > 0.5 * window.sample_period:
+        if not follows(window, kept[-1]):
             break
         kept.append(window)
     first = kept[0]
