@@ -1,5 +1,6 @@
 """``otolith export``: the raw samples of recordings, bit for bit, in a file that other programs read."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from otolith.cli.operation.export import ROWS_AT_ONCE
-from otolith.machine import load_machine
-from otolith.runtime.replay import open_recorded
+from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime import replay
+from otolith.runtime.replay import open_recorded, open_recordings
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay.readers import Reader
 from tests.cli.commands import otolith
 from tests.cli.replays import HEADING, MACHINE, Lines, recorded, written
 from tests.messages import assert_says, raises_saying
@@ -76,3 +79,18 @@ def test_what_fails_leaves_no_file(tmp_path: Path, rows: Lines) -> None:
     assert not output.exists()
     with pytest.raises(OSError, match="missing"):
         otolith("export", MACHINE, first, "--output", tmp_path / "missing" / "all.parquet")
+
+
+def test_a_file_that_another_export_has_begun_meanwhile_stays(
+    tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "all.parquet"
+
+    def opened(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
+        output.write_bytes(b"of the other one")
+        return open_recordings(machine, files)
+
+    monkeypatch.setattr(replay, "open_recordings", opened)
+    with pytest.raises(OSError, match="exists"):
+        otolith("export", MACHINE, written(tmp_path, rows), "--output", output)
+    assert output.read_bytes() == b"of the other one"

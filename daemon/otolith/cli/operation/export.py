@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import click
 
@@ -39,12 +39,8 @@ def export(file: Path, data: tuple[Path, ...], output: Path) -> int:
     from otolith_drivers.errors import counted
 
     machine, stop = load_machine(file, with_driver=False), StopSignal()
-    try:
-        with open_recordings(machine, data) as reader, progress_line("reading", enabled=True) as show:
-            rows, recordings = _write(machine, reader, output, show, stop.received)
-    except BaseException:
-        output.unlink(missing_ok=True)
-        raise
+    with open_recordings(machine, data) as reader, progress_line("reading", enabled=True) as show:
+        rows, recordings = _write(machine, reader, output, show, stop.received)
     if stop.received():
         output.unlink(missing_ok=True)
         return stop.code()
@@ -58,7 +54,22 @@ def export(file: Path, data: tuple[Path, ...], output: Path) -> int:
 def _write(
     machine: "LoadedMachine", data: "Reader", path: Path, show: Callable[[str], None], stopped: Callable[[], bool]
 ) -> tuple[int, int]:
-    """Write all rows, and return how many there are, of how many recordings."""
+    """Write all rows into a new file, and return how many there are, of how many recordings."""
+    try:
+        target = path.open("xb")
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    try:
+        with target:
+            return _write_rows(machine, data, target, show, stopped)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _write_rows(
+    machine: "LoadedMachine", data: "Reader", target: BinaryIO, show: Callable[[str], None], stopped: Callable[[], bool]
+) -> tuple[int, int]:
     import numpy as np
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -66,11 +77,7 @@ def _write(
     schema, rows, recordings = _schema(machine), 0, 0
     signals = schema.names[2:]
     split = dict.fromkeys((TIME, *signals), "BYTE_STREAM_SPLIT")
-    try:
-        target = path.open("xb")
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    with target, pq.ParquetWriter(
+    with pq.ParquetWriter(
         target, schema, compression="zstd", use_dictionary=[RECORDING], column_encoding=split
     ) as writer:  # fmt: skip
         for part in _joined(data.chunks()):
