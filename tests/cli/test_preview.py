@@ -157,8 +157,11 @@ def test_a_window_that_is_too_short_for_its_noise_gets_a_longer_one(tmp_path: Pa
     assert previewed(tmp_path / "data.csv", pasted).windows.length_s == preview.proposed.length_s
 
 
-def test_a_window_that_trades_its_parameters_gets_one_that_holds_the_step(tmp_path: Path) -> None:
-    """A servo whose torque steps every 20 s: in 2 s at one speed viscous and dry friction are traded."""
+def servo(tmp_path: Path) -> tuple[LoadedMachine, list[str]]:
+    """A servo whose torque steps every 20 s, and the lines of its table: in 2 s at one speed two frictions are traded.
+
+    These are viscous and dry friction.
+    """
     (tmp_path / "servo.toml").write_text(SERVO, encoding="utf-8")
     text = SERVO_MACHINE.replace('length = "5 s"', 'length = "2 s"') + SERVO_SIGNALS
     (tmp_path / "m.toml").write_text(text, encoding="utf-8")
@@ -168,15 +171,34 @@ def test_a_window_that_trades_its_parameters_gets_one_that_holds_the_step(tmp_pa
         lines.append(f"{0.01 * index:.2f},{torque},{speed + 0.5 * random.normal():.4f}")
         for _ in range(10):
             speed += 1e-3 * (torque - 4e-4 * speed - 0.0366 * math.tanh(speed / 2.0)) / 2e-4
+    return load_machine(tmp_path / "m.toml", with_driver=False), lines
+
+
+def test_a_window_that_trades_its_parameters_gets_one_that_holds_the_step(tmp_path: Path) -> None:
+    machine, lines = servo(tmp_path)
     data = tmp_path / "data.csv"
     data.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    preview = preview_recording(load_machine(tmp_path / "m.toml", with_driver=False), [data])
+    preview = preview_recording(machine, [data])
     assert any(2 * accuracy.determined < preview.windows.analysed for accuracy in preview.windows.parameters.values())
     proposed = preview.proposed
     assert 2.0 < proposed.length_s <= 30.0
     assert all(2 * accuracy.determined >= proposed.analysed for accuracy in proposed.parameters.values())
     (line,) = [remark for remark in preview.remarks if "would bring" in remark]
     assert_says(line, "T_c", "instead of")
+
+
+def test_no_window_is_told_of_that_no_recording_can_fill(tmp_path: Path) -> None:
+    """Recordings of 8 s each, with pauses between."""
+    machine, (header, *rows) = servo(tmp_path)
+    files = [tmp_path / f"{number}.csv" for number in range(5)]
+    for number, file in enumerate(files):
+        begin = 4000 * number
+        file.write_text("\n".join([header, *rows[begin : begin + 800]]) + "\n", encoding="utf-8")
+    preview = preview_recording(machine, files)
+    assert preview.windows.moving
+    assert preview.proposed.length_s <= 8.0
+    for remark in preview.remarks:
+        assert "would bring" not in remark or "a window of 5 s" in remark
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])

@@ -206,9 +206,8 @@ def _proposal(
 ) -> tuple[_Survey, str]:
     """Return the survey of a window that fits the data better, made by ``again``, and what a longer one would bring.
 
-    If no length is better, the survey is ``survey``. Parameters that a window trades with each other may become
-    separable in a longer one, which holds a step of the inputs: then lengths are tried, and the shortest that
-    determines most parameters is taken.
+    If none is better, it is ``survey``. Parameters that a window trades with each other may become separable in one
+    that holds a step of the inputs: then longer ones are tried; the shortest that determines most parameters is taken.
     """
     best = _better_window(machine, survey, again)
     if not best.windows.moving or not any(map(_is_traded, best.windows.parameters.values())):
@@ -218,9 +217,9 @@ def _proposal(
     length, latest = best.windows.length_s, best
     for _ in range(MAX_TRIED):
         length = whole_length(_nice_above(LENGTH_FACTOR * length), period)
-        if length > longest:
-            break
-        latest = again(_with_window(machine, length, period))
+        if length > longest or not (tried := again(_with_window(machine, length, period))).windows.moving:
+            break  # no recording holds one
+        latest = tried
         if _separable(latest) > _separable(best):
             best = latest
             if _separable(best) == len(machine.problem.free):
@@ -228,7 +227,8 @@ def _proposal(
     following = whole_length(_nice_above(LENGTH_FACTOR * best.windows.length_s), period)
     if best is survey or latest is not best or following > longest:
         return best, "" if latest is best else _longer(best, latest)
-    return best, _longer(best, again(_with_window(machine, following, period)))
+    longer = again(_with_window(machine, following, period))
+    return best, _longer(best, longer) if longer.windows.moving else ""
 
 
 def _is_traded(accuracy: ExpectedAccuracy) -> bool:
