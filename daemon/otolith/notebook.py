@@ -182,13 +182,15 @@ class Twin:
     def adapted(self, *recordings: str | Path) -> "Twin":
         """Return the twin after ``recordings``, each in a form that ``otolith replay`` reads.
 
-        It begins with what the machine file states, as a replay does, and not with what this twin has learned.
+        It begins with what the machine file states and the operator decided of components, as a replay does, and not
+        with what this twin has learned.
 
         Raises:
             otolith_drivers.errors.ConfigurationError: a recording cannot be used, or is too short for a window.
         """
         with open_recordings(self.machine, [Path(path) for path in recordings]) as reader:
             replay = Replay(self.machine, reader)
+            replay.state = store_of(self.machine).decided(replay.state)
             for _ in replay.reports():
                 pass
         return Twin(self.machine, replay.state, replay.state.posterior)

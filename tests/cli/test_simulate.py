@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from otolith import Twin
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.state import AdaptationState, OperatorDecisions
 from otolith.machine import load_machine
 from otolith.storage.history import history_directory
 from otolith.storage.log_history import log_history
@@ -221,6 +221,15 @@ def test_what_cannot_be_used_any_more_does_not_matter_where_a_recording_is_adapt
         otolith("simulate", machine, "--inputs", plan)
     assert_says(otolith("simulate", machine, "--inputs", plan, "--after", monday).stdout, "251 records")
     assert "model" in otolith("twin", "export", machine, "--modelica", "--after", monday).stdout
+
+
+def test_what_is_rejected_is_not_adapted_to_either(machine: Path) -> None:
+    """As in a replay of the same recording."""
+    key, store = "shaft/periodic/angle(omega)", store_of(load_machine(machine, with_driver=False))
+    assert key not in Twin.fresh(machine).adapted(machine.with_name("monday.csv")).posterior.problem.excluded
+    with store.locked():
+        store.operator.write(OperatorDecisions(rejected=frozenset({key})))
+    assert key in Twin.fresh(machine).adapted(machine.with_name("monday.csv")).posterior.problem.excluded
 
 
 def test_options_that_exclude_each_other_are_a_usage_error(machine: Path) -> None:

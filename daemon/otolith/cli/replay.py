@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts
-from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, restore_components
+from otolith.adaptation.state import AdaptationState
 from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.console import Localised, Terminal
 from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, texts_of, title
@@ -214,14 +214,11 @@ def _with_decisions(machine: LoadedMachine, state: AdaptationState, directory: P
     if directory is not None and not (directory / COMPONENTS).is_dir():
         raise ConfigurationError(f"{directory}: no state directory: it has no folder {COMPONENTS!r}")
     store = store_of(machine, directory)
-    decisions = store.decisions()
-    approved = [record for record in store.components() if record.adopted.component.key in decisions.approved]
-    chosen = {"approved": sorted(record.adopted.component.key for record in approved),
-              "rejected": sorted(decisions.rejected)}  # fmt: skip
+    chosen = {"approved": sorted(record.adopted.component.key for record in store.approved()),
+              "rejected": sorted(store.decisions().rejected)}  # fmt: skip
     if told := "; ".join(f"{name}: {', '.join(keys)}" for name, keys in chosen.items() if keys):
         echo(f"{store.decisions_path}: the replay uses these decisions: {told}", err=True)
-    state = restore_components(state, tuple(approved))
-    return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))
+    return store.decided(state)
 
 
 def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool]) -> None:

@@ -14,7 +14,13 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+from otolith.adaptation.state import (
+    AdaptationState,
+    ComponentRecord,
+    OperatorDecisions,
+    apply_decisions,
+    restore_components,
+)
 from otolith.health.events import HealthState
 from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import History
@@ -151,6 +157,17 @@ class StateStore:
         except ValueError as error:
             raise ConfigurationError(f"{self.components_path}: {error}: {REMEDY}") from error
         return learned.components
+
+    def approved(self) -> tuple[ComponentRecord, ...]:
+        """Return the saved components that the operator approved; raises as :meth:`components` if there are any."""
+        keys = self.decisions().approved
+        return tuple(row for row in self.components() if row.adopted.component.key in keys) if keys else ()
+
+    def decided(self, state: AdaptationState) -> AdaptationState:
+        """Return the state before the first window with those components, and without those that are rejected."""
+        decisions = self.decisions()
+        state = restore_components(state, self.approved())
+        return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))
 
     def histories(self) -> dict[str, History]:
         """Return the saved histories of parameters of this machine; none as, and raises as :meth:`components`."""
