@@ -111,7 +111,7 @@ class Twin:
         """
         fresh = cls.fresh(path)
         store = store_of(fresh.machine)
-        plan = with_baselines(fresh.machine.plan, store.decisions().baselines)
+        plan = with_baselines(fresh.machine.plan, store.decisions().holding(fresh.machine.problem))
         state, reason = store.peek(replace(fresh.learned, plan=plan))
         if reason:
             remedy = "run the daemon, or adapt the twin to a recording: Twin.fresh(...).adapted(...), or --after"

@@ -193,6 +193,37 @@ def test_what_was_found_with_other_values_is_not_asked_about(ran: Path, monkeypa
     assert not store.decisions().approved | store.decisions().rejected
 
 
+@pytest.mark.parametrize("by_hand", [False, True], ids=["written", "by hand"])
+def test_a_baseline_of_new_values_is_none_for_a_daemon_that_has_the_old_ones(
+    ran: Path, by_hand: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With other known values the same machine has another resistance and friction."""
+
+    def nothing(*_: object) -> None:
+        raise UnusableData("no window can be used")
+
+    monkeypatch.setattr(noise, "identified_record", nothing)
+    running = load_machine(ran, with_driver=False)
+    assert dict(running.problem.known)["L_a"] == pytest.approx(0.673)
+    text = ran.read_text(encoding="utf-8")
+    if by_hand:
+        ran.write_text(text.replace("[parameters]", '[parameters]\nL_a = "0.7 H"'), encoding="utf-8")
+    else:
+        values = OwnValues((OwnValue("L_a", 0.7, 0.01),), {}, 1.0, 4, {"omega": 1.0}, 1.0)
+        monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    result = otolith("commission", ran, *SPAN, "--windows", "4", *([] if by_hand else ["--write"]))
+    assert dict(load_machine(ran, with_driver=False).problem.known)["L_a"] == pytest.approx(0.7)
+    last = result.stderr.splitlines()[-1]
+    assert_says(last, "next:", f"otolith run {ran}")
+    assert "next window" not in result.stderr
+    decisions = store_of(running).decisions()
+    state = apply_decisions(initial_state("m", "s", running.problem, running.plan), decisions)
+    assert state.plan.parameters == running.plan.parameters
+    started = load_machine(ran, with_driver=False)
+    state = apply_decisions(initial_state("m", "s", started.problem, started.plan), decisions)
+    assert state.plan.parameters["R_a"].has_baseline
+
+
 LIMITS = {"watch": ["-10 %", "+10 %"], "act": ["-20 %", "+20 %"], "low": "4 ohm"}
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
+from otolith.adaptation.fingerprints import fingerprint_of
+from otolith.adaptation.state import EVERYTHING, OperatorDecisions, apply_decisions, initial_state
 from otolith.cli.main import cli
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import Level, Limit, MonitoredQuantity
@@ -97,6 +98,25 @@ def test_a_decision_replaces_the_plan_and_its_forecasts(own_machine: OwnMachine)
     assert apply_decisions(changed, OperatorDecisions()).plan.parameters == machine.plan.parameters
 
 
+def test_a_baseline_of_other_values_waits_for_a_daemon_that_has_them(own_machine: OwnMachine) -> None:
+    """With those of the twin's example the same machine has another resistance: its limits would be those of chance."""
+    machine = load_machine(own_machine.machine, with_driver=False)
+    state = initial_state("m", "s", machine.problem, machine.plan)
+    first = replace(HEALTHY, model=fingerprint_of(machine.problem))
+    running = apply_decisions(state, OperatorDecisions(baselines={"R_a": first}))
+    known = tuple((name, 1.1 * value) for name, value in machine.problem.known)
+    restarted = initial_state("m", "s", replace(machine.problem, known=known), machine.plan)
+    second = replace(HEALTHY, value=4.0, model=fingerprint_of(restarted.problem))
+    decisions = OperatorDecisions(baselines={"R_a": second})
+    assert apply_decisions(state, decisions).plan.parameters == machine.plan.parameters
+    kept = apply_decisions(running, replace(decisions, resets={EVERYTHING: 1.0}))
+    assert kept.plan.parameters == running.plan.parameters
+    assert apply_decisions(replace(kept, plan=machine.plan), decisions).plan.parameters == running.plan.parameters
+    assert apply_decisions(kept, OperatorDecisions()).plan.parameters == machine.plan.parameters
+    assert apply_decisions(restarted, decisions).plan.parameters["R_a"].nominal == 4.0
+    assert (decisions.waiting(running.problem), decisions.waiting(restarted.problem)) == (("R_a",), ())
+
+
 def test_the_command_takes_the_saved_estimates(
     own_machine: OwnMachine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,6 +133,7 @@ def test_the_command_takes_the_saved_estimates(
     assert "baseline R_a = 7.000 ± 0.028 Ω, mean of 50 estimates" in result.output
     assert "beyond its limit" not in result.output
     assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
+    assert store.decisions().baselines["R_a"].model == fingerprint_of(machine.problem)
     store.save(replace(state, health=HealthState(histories={"R_a": history(5.9, 50)})))
     worn = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert (

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.health.labels import MAX_SPANS, TimeLabels, clock_event, expiry_event
+from otolith.health.labels import MAX_SPANS, TimeLabels, baseline_event, clock_event, expiry_event
 from otolith.health.limits import Level
 from otolith.health.schema import (
     CrossingDocument,
@@ -19,7 +19,7 @@ from otolith.health.schema import (
     PartDocument,
     ReportDocument,
 )
-from otolith.health.text import event_text
+from otolith.health.text import event_text, texts_in
 from tests.messages import assert_says
 from tests.storage.histories import START, document
 
@@ -103,3 +103,12 @@ def test_the_event_of_a_certificate_names_it_and_its_end_in_each_language() -> N
         event = expiry_event(START, "press.crt", 1_801_353_600.0, 7, language)
         assert (event.change, event.end, event.state, event.part) == (EventChange.NOTED, START, Level.OK, "daemon")
         assert_says(event_text(event), "press.crt", "2027-01-31")
+
+
+def test_the_hint_of_a_baseline_that_waits_is_the_matter_of_a_specialist_in_each_language() -> None:
+    for language in ("en", "de"):
+        for key in ("baseline_waits", "baseline_is_of_other_values"):
+            text = texts_in(language)(key, names="R_a", file="motor.toml")
+            event = baseline_event(START, text, 7, language)
+            assert (event.change, event.end, event.is_silent) == (EventChange.NOTED, START, True)
+            assert_says(event_text(event), "R_a", "motor.toml")

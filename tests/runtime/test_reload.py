@@ -5,13 +5,16 @@ from pathlib import Path
 
 import pytest
 
+from otolith.adaptation.fingerprints import fingerprint_of
 from otolith.adaptation.state import with_problem
 from otolith.health.prognosis import Baseline
+from otolith.health.schema import EventChange
 from otolith.machine import load_machine
 from otolith.runtime.service import Reload, Service, reloaded
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
+from tests.messages import assert_says
 
 TEXT = """[machine]
 name = "motor"
@@ -114,6 +117,38 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     limited = service._supervisor._next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)
+
+
+def test_a_baseline_of_other_values_waits_for_a_restart_and_is_a_hint(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Until then limits refer to what the daemon estimates with the values of its start."""
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
+    path = tmp_path / "motor.toml"
+    path.write_text(text, encoding="utf-8")
+    service = Service(load_machine(path))
+    service._started_at = 1.0
+    path.write_text(text.replace("[parameters]", '[parameters]\nL_a = "0.2 H"'), encoding="utf-8")
+    new = load_machine(path)
+    assert new.problem.known != service._machine.problem.known
+    store = store_of(service._machine)
+    found = Baseline(3.1, 0.01, 50, 1.0, fingerprint_of(new.problem))
+    store.operator.write(replace(store.decisions(), baselines={"R_a": found}))
+    for _ in range(2):  # a note of a person comes later
+        after = service._decided(service._supervisor.state, store.decisions())
+        assert after.plan.parameters == service._machine.plan.parameters
+    (event,) = service._noted
+    assert (event.is_hint, event.change) == (True, EventChange.NOTED)
+    assert_says(event.text, "R_a", "restart", str(path))
+    assert caplog.text.count(event.text) == 1
+    restarted = Service(new)
+    state = restarted._decided(restarted._supervisor.state, store.decisions())
+    assert (state.plan.parameters["R_a"].nominal, restarted._noted) == (3.1, ())
+    path.write_text(text, encoding="utf-8")
+    back = Service(load_machine(path))
+    assert back._decided(back._supervisor.state, store.decisions()).plan.parameters == back._machine.plan.parameters
+    assert_says(back._noted[0].text, "R_a", f"otolith commission {path}")
 
 
 @pytest.mark.parametrize(("declared", "left"), [("", ("V_a",)), (', times = "polled"', ())])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from otolith.adaptation.fingerprints import fingerprint_of
 from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
@@ -61,6 +62,8 @@ class AdaptationState:
     """Limits and rules by which states and events follow from the reports."""
     health: HealthState = field(default_factory=HealthState)
     resets: Mapping[str, float] = field(default_factory=dict)  # The OperatorDecisions.resets that have been applied
+    baselines: Mapping[str, Baseline] = field(default_factory=dict)
+    """The OperatorDecisions.baselines that limits refer to."""
 
     @property
     def is_valid(self) -> bool:
@@ -94,7 +97,7 @@ def cleared(state: AdaptationState) -> AdaptationState:
         problem = without(problem, component)
     problem = replace(problem.with_levels(problem.stated_levels), steps=(), changing=())
     initial = initial_state(state.machine, state.site, problem, state.plan)
-    return replace(initial, restricted=state.restricted, approved=state.approved)
+    return replace(initial, restricted=state.restricted, approved=state.approved, baselines=state.baselines)
 
 
 def with_problem(state: AdaptationState, problem: Problem) -> AdaptationState:
@@ -149,8 +152,22 @@ class OperatorDecisions:
     """Unix seconds at which the operator reset a parameter, a component or everything, by name. Each is applied once.
     """
     baselines: Mapping[str, Baseline] = field(default_factory=dict)
-    """Of the parameters; relative limits refer to them."""
+    """Of the parameters; relative limits refer to those that :meth:`holding` returns."""
     notes: tuple[OperatorNote, ...] = ()  # What persons did with events
+
+    def holding(self, problem: Problem, before: Mapping[str, Baseline] | None = None) -> dict[str, Baseline]:
+        """Return the baselines that were found with the twin and the known values of ``problem``.
+
+        A parameter whose baseline was found with others has the one ``before``, if there is one.
+        """
+        model, kept = fingerprint_of(problem), before or {}
+        found = {name: item if item.holds_with(model) else kept.get(name) for name, item in self.baselines.items()}
+        return {name: item for name, item in found.items() if item is not None}
+
+    def waiting(self, problem: Problem) -> tuple[str, ...]:
+        """Return the parameters whose baselines were found with another twin or other known values."""
+        model = fingerprint_of(problem)
+        return tuple(sorted(name for name, item in self.baselines.items() if not item.holds_with(model)))
 
     def in_service_time(self, labels: TimeLabels, now: float) -> "OperatorDecisions":
         """Return the decisions with ``forgotten`` and ``notes`` on the clock of the windows, which shows ``now``.
@@ -178,11 +195,12 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
     excluded = state.restricted | decisions.rejected
     if excluded != state.problem.excluded:  # an open test was searched with other exclusions
         state = replace(with_problem(state, replace(state.problem, excluded=excluded)), test=None)
-    plan = with_baselines(state.plan, decisions.baselines)
+    baselines = decisions.holding(state.problem, state.baselines)
+    plan = with_baselines(state.plan, baselines)
     if plan.parameters != state.plan.parameters:  # the forecasts are about other limits
         state = replace(state, plan=plan, health=replace(state.health, forecasts={}))
-    health = state.health.with_notes(decisions.notes)
-    return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets), health=health)
+    state = replace(state, baselines=baselines, health=state.health.with_notes(decisions.notes))
+    return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets))
 
 
 def _reset(state: AdaptationState, name: str) -> AdaptationState:

@@ -56,6 +56,13 @@ def use_state_of_service(machine: Path | str) -> bool:
     return True
 
 
+def restart_command(machine: Path) -> str:
+    """Return how the daemon of a machine file is started again."""
+    if machine.absolute().parent == INSTALLED:
+        return f"systemctl restart otolith@{machine.stem}"
+    return f"stop the daemon, then 'otolith run {machine}'"
+
+
 def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     """Return the file of an option; raise BadParameter if it exists."""
     if path is not None and path.exists():

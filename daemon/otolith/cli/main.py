@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith import __version__
-from otolith.cli.commissioning.commission import baseline, commission
+from otolith.cli.commissioning.commission import commission
 from otolith.cli.commissioning.components import components, reset
 from otolith.cli.commissioning.config import config
 from otolith.cli.commissioning.draft.command import init
@@ -37,6 +37,7 @@ from otolith.cli.common import (
     reader_options,
     shipped_directory,
 )
+from otolith.cli.operation.baseline import baseline
 from otolith.cli.operation.event import event
 from otolith.cli.operation.explain import explain
 from otolith.cli.operation.export import export

@@ -26,7 +26,7 @@ from otolith.health.text import texts_in
 from otolith.health.times import moment_text
 from otolith_drivers.config_files import DocumentModel
 
-CERTIFICATE = "certificate"
+CERTIFICATE, BASELINE = "certificate", "baseline"
 
 # Thresholds: docs/reference/thresholds-health.md has the origin of each.
 MAX_SPANS = 200  # of different labels; of more, the two neighbours that differ least become one
@@ -154,6 +154,12 @@ def expiry_event(time: float, certificate: str, end: float, window: int, languag
     text = texts_in(language)("certificate_expires", certificate=certificate, end=moment_text(end, "UTC")[:10])
     event = _noted(CERTIFICATE, time, text, EvidenceDocument(windows=(window, window)), language)
     return event.model_copy(update={"id": f"{CERTIFICATE}/{end:.0f}@{time:.1f}", "part": DAEMON})
+
+
+def baseline_event(time: float, text: str, window: int, language: Language) -> EventDocument:
+    """Return the hint that baselines wait for other values, at a service time."""
+    event = _noted(BASELINE, time, text, EvidenceDocument(windows=(window, window)), language)
+    return event.model_copy(update={"part": DAEMON, "state": Level.HINT})
 
 
 def expiry_notices(events: Iterable[EventDocument]) -> dict[float, float]:

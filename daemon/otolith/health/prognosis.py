@@ -396,6 +396,11 @@ class Baseline:
     sd: float
     windows: int  # Number of estimates that it is the mean of
     end: float  # Service time of the last of them, s
+    model: str = ""  # Fingerprint of twin and known values with which it was found; empty in older files
+
+    def holds_with(self, model: str) -> bool:
+        """Whether it is the value that a daemon estimates with the twin and the values of this fingerprint."""
+        return self.model in ("", model)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ from otolith.adaptation.state import (
 )
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
-from otolith.health.labels import clock_event, expiry_event
+from otolith.health.labels import baseline_event, clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
@@ -196,6 +196,7 @@ class Service:
         self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
+        self._waiting: tuple[str, ...] = ()  # Parameters whose baselines were found with other values
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
         self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
@@ -326,7 +327,19 @@ class Service:
     def _decided(self, state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
         for event in missed_notes(state.health, decisions.notes):
             log.warning("event %s is over: what a person did with it is not kept; a comment can be given again", event)
+        self._note_waiting(decisions.waiting(state.problem))
         return apply_decisions(state, decisions.in_service_time(self._clock.labels, self._clock.now()))
+
+    def _note_waiting(self, names: tuple[str, ...]) -> None:
+        """Say once which baselines were found with other values than this daemon has, and what to do."""
+        before, self._waiting = self._waiting, names
+        if not set(names) - set(before):
+            return
+        key = "baseline_waits" if self._started_at else "baseline_is_of_other_values"
+        language, file = self._machine.file.machine.language, str(self._machine.path)
+        text = self._machine.plan.texts(key, names=", ".join(names), file=file)
+        log.warning("%s", text)
+        self._noted = (*self._noted, baseline_event(self._clock.now(), text, self._windows, language))
 
     def _start_history(self) -> None:
         if self._history is not None:

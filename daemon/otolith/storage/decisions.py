@@ -21,7 +21,7 @@ from otolith.storage.learned_state import VERSION, LearnedState, check_version
 from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError, ServiceError
 
-DECISIONS_VERSION = 3
+DECISIONS_VERSION = 4
 LOCKS = Path("/proc/locks")
 REMEDY = "move the file away to start without it"
 MAX_STATE_BYTES = 8 * 1024 * 1024  # docs/reference/thresholds-storage.md has the origin

@@ -4,8 +4,6 @@ Numbers are saved with all their digits, so that a restored filter is the same b
 before it is used: a file may be damaged, written by another version, or belong to another machine.
 """
 
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Annotated, Any
@@ -14,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.fingerprints import configuration_fingerprint, twin_fingerprint, values_fingerprint
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
@@ -141,31 +140,6 @@ def check_version(text: str, newest: int) -> None:
     _require(1 <= version <= newest, f"version {version} of the format: this Otolith reads 1 to {newest}")
 
 
-def twin_fingerprint(twin: Definition) -> str:
-    """Return a hash of what the equations of a twin mean; titles and meanings in words do not count."""
-    quantities = (twin.states, twin.parameters, twin.outputs)
-    named = [[(each.name, each.unit) for each in group] for group in quantities]
-    inputs = [(each.name, each.unit, each.hold) for each in twin.inputs]
-    constants = [(each.name, each.unit, each.value) for each in twin.constants]
-    definitions = [(name, expression) for name, expression, _ in twin.definitions]
-    places = [(each.name, each.unit, each.into, each.mode, each.through) for each in twin.sites]
-    return _hash([named, inputs, constants, definitions, places, twin.equations])
-
-
-def configuration_fingerprint(problem: Problem) -> str:
-    """Return a hash of what the machine file states of parameters and noise, without what was learned."""
-    free = [(item.name, item.nominal, item.low, item.high) for item in problem.free if not item.name.startswith("_")]
-    known = [pair for pair in problem.known if not pair[0].startswith("_")]
-    stated = problem.with_levels(problem.stated_levels)
-    noise = stated.noise, stated.input_noise, stated.process_noise
-    return _hash([free, known, noise, problem.open_loop])
-
-
-def values_fingerprint(problem: Problem) -> str:
-    """Return a hash of the values of the known parameters, with which a component is found."""
-    return _hash([pair for pair in problem.known if not pair[0].startswith("_")])
-
-
 def without_open_components(learned: LearnedState, reason: str) -> LearnedState:
     """Return what was learned without the components that nobody has approved; their events are dropped."""
     kept = tuple(item for item in learned.components if item.adopted.approval is Approval.APPROVED)
@@ -173,10 +147,6 @@ def without_open_components(learned: LearnedState, reason: str) -> LearnedState:
     lost -= {event_key(item.adopted.component) for item in kept}
     update = {"components": kept, "health": learned.health.without_events(lost, reason)}
     return learned.model_copy(update=update)
-
-
-def _hash(content: list[object]) -> str:
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def learned_state(state: AdaptationState, signal_fingerprint: str, clock: SavedClock | None = None) -> LearnedState:

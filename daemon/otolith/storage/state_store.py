@@ -14,6 +14,12 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from otolith.adaptation.fingerprints import (
+    configuration_fingerprint,
+    model_fingerprint,
+    twin_fingerprint,
+    values_fingerprint,
+)
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
@@ -32,11 +38,8 @@ from otolith.storage.learned_state import (
     LearnedState,
     SavedClock,
     check_components,
-    configuration_fingerprint,
     learned_state,
     restored,
-    twin_fingerprint,
-    values_fingerprint,
     without_open_components,
 )
 from otolith.twin.definition import Definition
@@ -173,6 +176,14 @@ class StateStore:
         """Return the saved histories of parameters of this machine; none as, and raises as :meth:`components`."""
         learned = self._learned()
         return {} if learned is None else dict(learned.health.histories)
+
+    def model(self) -> str:
+        """Return the fingerprint of twin and values with which it was learned; empty if none is known.
+
+        Raises as :meth:`components`.
+        """
+        learned = self._learned()
+        return "" if learned is None else model_fingerprint(learned.twin_fingerprint, learned.values_fingerprint)
 
     def taken(self) -> tuple[str, ...]:
         """Return the ids of the notes that the daemon of this machine has taken over, whatever else it learned."""

@@ -1,7 +1,7 @@
-"""``otolith commission`` and ``baseline``: what is normal for a machine, from a log of it or while its daemon runs."""
+"""``otolith commission``: what is normal for a machine, from a log of it or while its daemon runs."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from otolith.cli.commissioning.components import equation_of, key_of_record, loaded
-from otolith.cli.common import ANY_DATA_FILES, MACHINE_FILE, echo_warnings, local_time, progress_line
+from otolith.cli.common import ANY_DATA_FILES, MACHINE_FILE, echo_warnings, local_time, progress_line, restart_command
+from otolith.cli.operation.baseline import keep_baseline
 from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise
     from otolith.commissioning.value_search import OwnValues
-    from otolith.health.labels import TimeLabels
-    from otolith.health.prognosis import Baseline, History
+    from otolith.health.prognosis import History
     from otolith.machine import LoadedMachine
     from otolith.storage.history import HistoryReader
     from otolith.storage.state_store import StateStore
@@ -32,7 +32,6 @@ WINDOWS = 30  # of which noise, delays and values are identified
 REACH = 4.0  # times a healthy value: bounds of its estimate
 LOAD_SHARE = 0.5  # of the bounds of an unknown load, beyond which the load of the record makes them wider
 REPORTS_AT_ONCE = 1000  # that are read from the history
-MORE_MOTION = "record more changes of speed and load, or set the baseline later by 'otolith baseline'"
 
 
 Decide = Callable[[], bool | None]  # Whether a component belongs to the healthy machine; None: it is left open
@@ -292,6 +291,7 @@ def _commission(
     windows: int,
     how: Manner,
 ) -> None:
+    from otolith.adaptation.fingerprints import fingerprint_of
     from otolith.adaptation.state import ComponentRecord
     from otolith.cli.commissioning.noise import delay_lines, identified_record, noise_lines
     from otolith.commissioning.identification import explains_no_window
@@ -320,7 +320,7 @@ def _commission(
             echo("# put these tables into the machine file in place of its own, or let --write do it", err=True)
     _review(machine, store, state, components, decide=how.decide)
     try:
-        keep_baseline(machine, store, state.health.histories, advice)
+        keep_baseline(machine, store, state.health.histories, advice, fingerprint_of(machine.problem))
     except OtolithError as error:  # nothing that has limits, or a record that is too short
         echo(*str(error).split("\n"), err=True)
 
@@ -435,6 +435,7 @@ def _commission_running(
     how: Manner,
 ) -> None:
     """Commission by what a daemon has recorded and estimated from the first time of ``span`` to the second."""
+    from otolith.adaptation.fingerprints import fingerprint_of
     from otolith.cli.commissioning.noise import HealthySpan, UnusableData, delay_lines, identified_record, noise_lines
     from otolith.storage.history import HistoryReader, history_path
 
@@ -458,23 +459,32 @@ def _commission_running(
             echo(*noise_lines(machine, record.noise), *delay_lines(machine, record.delays))
     if machine is not before:
         echo("a running daemon takes these lines over when it is started again", err=True)
-    known = store.decisions()
-    records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
-    has_new_values = machine.file.parameters != before.file.parameters
-    if has_new_values and records:
-        keys = ", ".join(map(key_of_record, records))
-        echo(f"{keys}: found with the values before, so nothing is asked; the daemon that starts drops it", err=True)
-        records = []
-    approved, rejected = asked(machine, records, decide=how.decide)
-    if records:
-        _decide(store, approved, rejected)
+    model = fingerprint_of(machine.problem)
+    # The file may have been changed before, too: a daemon has the values that it had at its start.
+    is_waiting = model != (store.model() or fingerprint_of(before.problem))
+    has_new_values = is_waiting or machine.file.parameters != before.file.parameters
+    _review_running(machine, store, how, has_new_values=has_new_values)
     if not has_new_values:
         histories, advice = _estimated(machine, reader, span)
     else:  # what was estimated with other values does not count
         state, advice = _replayed(machine, data, how)
         histories = dict(state.health.histories)
-    keep_baseline(machine, store, histories, advice, labels=reader.labels())
-    echo("a running daemon takes the baseline over with its next window", err=True)
+    keep_baseline(machine, store, histories, advice, model, labels=reader.labels())
+    when = "when it is started again: it has other values now" if is_waiting else "with its next window"
+    echo(f"a running daemon takes the baseline over {when}", err=True)
+    if is_waiting or machine is not before:
+        echo(f"next: {restart_command(machine.path)}", err=True)
+
+
+def _review_running(machine: "LoadedMachine", store: "StateStore", how: Manner, *, has_new_values: bool) -> None:
+    """Ask for a decision on each component that a daemon has found, unless the file has other values than it."""
+    known = store.decisions()
+    records = [row for row in store.components() if key_of_record(row) not in known.approved | known.rejected]
+    if records and has_new_values:
+        keys = ", ".join(map(key_of_record, records))
+        echo(f"{keys}: found with the values before, so nothing is asked; the daemon that starts drops it", err=True)
+    elif records:
+        _decide(store, *asked(machine, records, decide=how.decide))
 
 
 def _warn_of_events(reader: "HistoryReader", span: tuple[float, float], zone: str | None) -> None:
@@ -511,87 +521,3 @@ def _estimated(
                 if (point := history_point(machine.plan, document, name)) is not None:
                     histories[name] = with_point(histories.get(name, ()), *point)
     return histories, advice
-
-
-@click.command()
-@MACHINE_FILE
-@click.option("--clear", is_flag=True, help="Return to the nominal values of FILE.")
-def baseline(file: Path, clear: bool) -> None:
-    """Take the present values of the machine in FILE as baseline.
-
-    It must be healthy. The values are the means of the saved estimates. Limits in percent refer to them
-    from then on, also those of a running daemon, with its next window.
-
-    \b
-    Examples:
-      otolith baseline my-machine.toml
-      otolith baseline my-machine.toml --clear
-    """
-    machine, store = loaded(file)
-    if clear:
-        store.operator.change(lambda before: replace(before, baselines={}))
-        echo("limits in percent refer to the values that the machine file states; others are not judged")
-    else:
-        keep_baseline(machine, store, store.histories(), {})
-
-
-def keep_baseline(
-    machine: "LoadedMachine",
-    store: "StateStore",
-    histories: "Mapping[str, History]",
-    advice: Mapping[str, str],
-    *,
-    labels: "TimeLabels | None" = None,
-) -> None:
-    """Store and print the baselines of ``histories``, and of each parameter with limits that has none why.
-
-    Times of ``histories`` are those of the service; with ``labels`` they are Unix times.
-
-    Raises:
-        ConfigurationError: no parameter has a baseline.
-    """
-    from otolith.cli.commissioning.check import lines_without_limits
-    from otolith.health.prognosis import find_baseline
-    from otolith_drivers.errors import ConfigurationError
-
-    limited = {name: row for name, row in machine.plan.parameters.items() if row.has_limits}
-    found = {name: find_baseline(histories.get(name, ()), row) for name, row in limited.items()}
-    kept = {name: row.baseline for name, row in found.items() if row.baseline is not None}
-    if labels is not None:
-        kept = {name: replace(item, end=labels.last(item.end)) for name, item in kept.items()}
-    if kept:
-        store.operator.change(lambda before: replace(before, baselines={**before.baselines, **kept}))
-    lines = list[str]()
-    for name, search in found.items():
-        if (item := kept.get(name)) is not None:
-            lines += _baseline_lines(machine, labels or store.labels(), name, item)
-        else:
-            then = "its limits wait for one" if limited[name].waiting else "its limits stay as they were"
-            lines.append(f"{name}: no baseline, {then}: {search.reason}")
-        if item is None or search.reason:
-            lines += [f"  {name} is not known well: {search.reason}"] if item is not None else []
-            lines.append(f"  what would determine it: {advice.get(name) or MORE_MOTION}")
-        if search.vague:
-            few = f"{search.vague} estimates of {name} are not counted"
-            why = f"near standstill, or without a change, a window shows it to ±{search.interval:.2g} only"
-            lines.append(f"  {few}: {why}")
-    lines += lines_without_limits(machine)
-    if not kept:
-        lines.insert(0, f"no baseline: {'none of its parameters has limits' if not limited else 'too little is known'}")
-        raise ConfigurationError("\n".join(f"{machine.path}: {line.strip()}" for line in lines))
-    echo(*lines, err=True)
-
-
-def _baseline_lines(machine: "LoadedMachine", labels: "TimeLabels", name: str, item: "Baseline") -> Iterator[str]:
-    from otolith.health.limits import Level
-    from otolith.health.text import interval_text
-    from otolith_drivers.units import quantity_text
-
-    row = machine.plan.parameters[name]
-    text, end = interval_text(item.value, item.sd, row.unit), labels.unix(item.end)
-    yield f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(end, machine.plan.timezone)}"
-    level, limit = row.level(item.value, item.sd, Level.OK)
-    if limit is not None:
-        beyond = f"{level} {limit.side} {quantity_text(limit.value, row.unit)}"
-        undo = "if the machine is not healthy, undo it: otolith baseline --clear"
-        yield f"{name}: beyond its limit {beyond}; {undo}"
