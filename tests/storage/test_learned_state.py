@@ -387,6 +387,18 @@ def test_other_known_values_keep_only_what_somebody_approved(approval: Approval,
     assert all("machine file have changed" in (item.reason or "") for item in warm.health.dropped)
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.1], ids=["noise", "known values"])
+def test_estimates_with_other_known_values_are_no_history_of_these(factor: float, tmp_path: Path) -> None:
+    """The daemon that starts would see a trend from one to the other, and 'otolith baseline' the mean of both."""
+    history = tuple((START + 2.0 * index, R_A, 1e-4) for index in range(40))
+    store = store_in(tmp_path)
+    store.save(replace(healthy(), health=HealthState(histories={"R_a": history})))
+    known = tuple((name, factor * value) for name, value in PROBLEM.known)
+    other = replace(PROBLEM, known=known, noise=(0.01, 0.02))
+    warm, _ = store.restore(replace(fresh(), posterior=type(fresh().posterior).initial(other)))
+    assert warm.health.histories == ({"R_a": history} if factor == 1.0 else {})
+
+
 def test_files_of_version_1_are_read(tmp_path: Path) -> None:
     for path in KEPT.glob("*.json"):
         shutil.copy(path, tmp_path)

@@ -140,12 +140,18 @@ def check_version(text: str, newest: int) -> None:
     _require(1 <= version <= newest, f"version {version} of the format: this Otolith reads 1 to {newest}")
 
 
-def without_open_components(learned: LearnedState, reason: str) -> LearnedState:
-    """Return what was learned without the components that nobody has approved; their events are dropped."""
+def without_found(learned: LearnedState, reason: str) -> LearnedState:
+    """Return what was learned with other known values: without components that nobody approved, and without histories.
+
+    Their events are dropped. Estimates with two values would be a trend, or a baseline between both.
+    """
     kept = tuple(item for item in learned.components if item.adopted.approval is Approval.APPROVED)
     lost = {event_key(item.adopted.component) for item in learned.components}
     lost -= {event_key(item.adopted.component) for item in kept}
-    update = {"components": kept, "health": learned.health.without_events(lost, reason)}
+    health, lost = learned.health, lost | {f"trend/{name}" for name in learned.health.histories}
+    for name in learned.health.histories:
+        health = health.without_history(name)
+    update = {"components": kept, "health": health.without_events(lost, reason)}
     return learned.model_copy(update=update)
 
 

@@ -40,7 +40,7 @@ from otolith.storage.learned_state import (
     check_components,
     learned_state,
     restored,
-    without_open_components,
+    without_found,
 )
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -281,7 +281,7 @@ class StateStore:
                 reason = "parameters or noise in the machine file have changed since it was saved"
                 learned = learned.model_copy(update={"filter": None, "health": learned.health.without_hints(reason)})
                 if learned.values_fingerprint not in ("", values_fingerprint(state.problem)):
-                    learned = without_open_components(learned, reason)
+                    learned = without_found(learned, reason)
             return restored(learned, state), reason, False
         except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
             reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
