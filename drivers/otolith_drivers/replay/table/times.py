@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from otolith_drivers.common.time_zones import LocalDates
 from otolith_drivers.errors import shown
-from otolith_drivers.replay.readers import Array, Integers
+from otolith_drivers.replay.readers import MAX_TIME, Array, Integers
 from otolith_drivers.units import factor
 
 DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
@@ -36,6 +36,7 @@ NO_YEAR = 1900  # of a date that has none, for strptime
 # Days since 30 December 1899, as spreadsheets count them: from 1980 to 2100. Such days since 1970 are after 2050.
 SPREADSHEET_DAYS, DAYS_TO_1970 = (29_221.0, 73_050.0), 25_569.0
 DAY, HOUR = 86_400.0, 3600.0  # s
+CALENDAR = (-6.2e10, MAX_TIME)  # s since 1970, which dates can have: from the year 5 on
 QUARTER = 900.0  # s: clocks of all zones change at such a time
 # Engineering choices, guarded by tests/drivers/replay/test_table_times.py.
 MIN_INTERVAL = 1e-6  # s: no logger of a machine writes rows more often, so their times are in another unit
@@ -171,7 +172,18 @@ class Clock:
 
 
 def on_wall_clock(local: Array, dates: LocalDates) -> Array:
-    """Return the Unix times of the next ``dates`` (n,), s since 1970 on the clocks of their zone."""
+    """Return the Unix times of the next ``dates`` (n,), s since 1970 on the clocks of their zone.
+
+    NaN stands for no time; one that no calendar has becomes infinity.
+    """
+    times: Array = np.where(np.isnan(local), np.nan, np.inf)
+    known = np.flatnonzero((local >= CALENDAR[0]) & (local <= CALENDAR[1]))
+    if len(known):
+        times[known] = _on_wall_clock(local[known], dates)
+    return times
+
+
+def _on_wall_clock(local: Array, dates: LocalDates) -> Array:
     quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
     begin = datetime(1970, 1, 1, tzinfo=UTC)
     moments = (begin + timedelta(seconds=QUARTER * float(quarter)) for quarter in quarters)
@@ -181,7 +193,7 @@ def on_wall_clock(local: Array, dates: LocalDates) -> Array:
         before = dates.last if row == 0 else float(first[row - 1])
         first[row] = dates.chosen(float(first[row]), float(second[row]), before)
     dates.assumed(len(local))
-    dates.last = float(first[-1]) if len(local) else dates.last
+    dates.last = float(first[-1])
     return np.asarray(first)
 
 
