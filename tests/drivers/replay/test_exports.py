@@ -248,3 +248,43 @@ def test_a_text_of_iba_has_names_below_the_line_of_the_times(tmp_path: Path) -> 
     assert [time for time, _ in found["n"]] == [0.0, 0.01]
     assert [value for _, value in found["n"]] == pytest.approx([1.0, 2.0])
     assert [value for _, value in found["M"]] == [1.5, 2.5]
+
+
+def test_a_tag_log_of_wincc_may_lack_a_time(tmp_path: Path) -> None:
+    lines = [*WINCC.splitlines(), *(f'"Speed";"";1;1;{time}' for time in ("", "abc", "1e30", "-1e30"))]
+    found = samples(written(tmp_path, "\n".join(lines) + "\n"), bad=4, zone="Europe/Berlin", speed={"column": "Speed"})
+    assert [value for _, value in found["speed"]] == [100.5, 101.5]
+
+
+LVM_SEGMENT = """Channels\t2
+Y_Unit_Label\t{unit}\tA
+Date\t2026/03/29\t2026/03/29
+Time\t12:00:00\t12:00:00
+***End_of_Header***
+X_Value\ta\tX_Value\tb\tComment
+0\t1\t0\t5
+0.1\t2\t\t
+x\t3\t\t
+"""
+LVM_HEAD = "LabVIEW Measurement\nSeparator\tTab\nDecimal_Separator\t.\nX_Columns\tMulti\n***End_of_Header***\n\n"
+
+
+def test_channels_of_a_labview_file_may_have_few_rows(tmp_path: Path) -> None:
+    path = written(tmp_path, LVM_HEAD + LVM_SEGMENT.format(unit="V"), "run.lvm")
+    assert samples(path, b={"of": "A"}) == {"b": [(NOON, 5.0)]}
+    assert samples(path, bad=1, a={"of": "V"}) == {"a": [(NOON, 1.0), (NOON + 0.1, 2.0)]}
+
+
+def test_a_channel_of_a_labview_file_has_one_unit(tmp_path: Path) -> None:
+    segments = [LVM_SEGMENT.format(unit=unit) for unit in ("V", "mV")]
+    with raises_saying(ConfigurationError, "run.lvm:22", "'a'", "'V'", "'mV'", "export"):
+        samples(written(tmp_path, LVM_HEAD + "\n".join(segments), "run.lvm"), a={"of": "V"})
+
+
+@pytest.mark.parametrize("title", ["", "2026 first run\n", "\ufeff"])
+@pytest.mark.parametrize("indent", ["", " ", "+"])
+def test_no_row_of_twincat_is_taken_for_a_key(tmp_path: Path, title: str, indent: str) -> None:
+    head = f"{title}Starttime of export\t134192000000000000\tSunday\n\nName\tspeed\nUnit\trpm\n\n"
+    rows = "".join(f"{indent}{number}\t{100 + number}\n" for number in range(5))
+    found = samples(written(tmp_path, head + rows), speed={"of": "rpm"})
+    assert [value for _, value in found["speed"]] == [100.0, 101.0, 102.0, 103.0, 104.0]

@@ -4,13 +4,14 @@ The times are in the first column, in one before each channel, or in none: then 
 ``Delta_X``. They count from ``Date`` and ``Time`` of the segment. Each segment has the same channels.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime, tzinfo
 from pathlib import Path
 
 from otolith_drivers.common.message_times import unix_time
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, shown
 from otolith_drivers.replay.exports.text import (
     Lines,
     Readable,
@@ -33,7 +34,7 @@ def opened(path: Path, text: Readable, wanted: Mapping[str, ColumnRequest], zone
     """See :class:`TextExport`."""
     _, request = wanted_signal(wanted)
     reader = _LvmText(path, text, request.column, zone)
-    unit = reader.unit if is_unit(reader.unit) else None
+    unit = reader.unit if reader.unit and is_unit(reader.unit) else None
     return header_of(path, wanted, RowForm(reader.number, "\t", 2, (0, "s"), (1, unit))), Lines(reader.rows())
 
 
@@ -44,6 +45,7 @@ class _LvmText:
         """Read to the first row."""
         self._path, self._text, self._channel, self._zone = path, text, channel, zone
         self.number = 0  # of the last line that was read
+        self.unit: str | None = None  # of the channel, empty if none is stated; None before the first segment
         self._separator = "\t"
         file = self._tags({})
         self._separator = SEPARATORS.get(file.get("Separator", [""])[0].casefold(), "\t")
@@ -86,7 +88,11 @@ class _LvmText:
         dimension = tag("X_Dimension", "Time")
         if dimension.casefold() != "time":
             raise ConfigurationError(f"{self._path}: X of {self._channel!r} is {dimension}, not Time")
-        self.unit = tag("Y_Unit_Label", "")
+        unit = tag("Y_Unit_Label", "")
+        if self.unit is not None and unit not in ("", self.unit):
+            units = f"{shown(self._channel)} is in {shown(unit)} here, but in {shown(self.unit)} above"
+            raise ConfigurationError(f"{self._path}:{self.number}: {units}: export the segments apart")
+        self.unit = unit or self.unit or ""
         day, clock = (tag(name, self._file.get(name, [""])[0]) for name in ("Date", "Time"))
         self._begin, self._row = self._moment(day, clock), 0
         self._first, self._step = (self._float(tag(name, text)) for name, text in (("X0", "0"), ("Delta_X", "0")))
@@ -122,10 +128,13 @@ class _LvmText:
                 yield "\n"
                 continue
             time = self._first + self._row * self._step
+            written = ""
             if self._columns != "no":
-                time = self._float(cells[self._time] if self._time < len(cells) else "")
+                written = cells[self._time] if self._time < len(cells) else ""
+                time = self._float(written)
             self._row += 1
-            yield f"{self._begin + time!r}\t{value.replace(self._decimal, '.')}\n"
+            written = written if math.isnan(time) else repr(self._begin + time)
+            yield f"{written}\t{value.replace(self._decimal, '.')}\n"
 
 
 LVM = TextExport("a LabVIEW measurement file (LVM)", re.compile(r"LabVIEW Measurement\s*"), opened)

@@ -71,11 +71,12 @@ def opened(path: Path, text: Readable, wanted: Mapping[str, ColumnRequest], zone
 
 
 def _head(text: Readable) -> list[str]:
-    """The lines to the first row, and that row."""
-    lines = list[str]()
+    """The lines to the first row, and that row; a row begins with a number, and channels may begin with blank cells."""
+    lines, separator = list[str](), ""
     while len(lines) < MAX_KEYS and (line := text.readline(MAX_LINE)):
-        lines.append(line)
-        if line[:1].isdigit() or line[:1] == "-":
+        lines.append(line.lstrip("\ufeff"))
+        separator = separator or (lines[-1][len(START)] if TWINCAT.begins.match(lines[-1]) else "")
+        if separator and is_number(next((cell for cell in map(str.strip, line.split(separator)) if cell), "")):
             break
     return lines
 
