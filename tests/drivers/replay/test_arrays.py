@@ -1,7 +1,9 @@
 """Parquet, Feather, HDF5, MATLAB and TDMS files as tables: each has the values that were written by another library."""
 
+import gzip
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, timedelta
+from datetime import time as clock_time
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -14,6 +16,7 @@ from nptdms import ChannelObject, TdmsWriter
 from pyarrow import feather, parquet
 from scipy import io
 
+from otolith_drivers.base import Setup, Signal
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.exports import arrays
 from otolith_drivers.replay.exports.stores import STORES
@@ -182,3 +185,108 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     )
     with raises_saying(ConfigurationError, name, "extra", "pip install"):
         samples(tmp_path / name, n={"column": "speed"})
+
+
+def parquet_of(folder: Path, **columns: Any) -> Path:
+    path = folder / "run.parquet"
+    parquet.write_table(pa.table(columns), path)
+    return path
+
+
+def hdf5_of(folder: Path, **arrays: Any) -> Path:
+    path = folder / "run.h5"
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
+    return path
+
+
+OTHERS: dict[str, Any] = {
+    "dates": pa.array([date(2026, 3, 29)] * 50),
+    "times of day": pa.array([clock_time(1, 2, 3)] * 50),
+    "durations": pa.array([timedelta(1)] * 50),
+    "lists": pa.array([[1, 2]] * 50),
+    "structures": pa.array([{"a": 1}] * 50),
+    "bytes": pa.array([b"\xff"] * 50),
+    "large integers": pa.array([2**60 + 1] * 50),
+    "texts": pa.array(['a;b\t"c\nd'] * 50),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_columns_may_have_anything(kind: str, tmp_path: Path) -> None:
+    path = parquet_of(tmp_path, **{"a;b": OTHERS[kind], "t": TIMES, "#\nd": OTHERS[kind], "speed": SPEED})
+    assert samples(path, speed={})["speed"] == list(zip(TIMES.tolist(), SPEED.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", ["a;b", "c\nd", "e\tf", 'g"h', "#i", '"j"', "sep=;"])
+def test_a_column_may_have_any_name(name: str, tmp_path: Path) -> None:
+    path = parquet_of(tmp_path, **{name: SPEED, "t": TIMES})
+    assert samples(path, x={"column": name})["x"] == list(zip(TIMES.tolist(), SPEED.tolist(), strict=True))
+
+
+def test_integers_may_count_nanoseconds(tmp_path: Path) -> None:
+    path = parquet_of(tmp_path, stamp=(1e9 * (NOON + TIMES)).astype(np.int64), speed=SPEED)
+    found = samples(path, speed={"time": {"column": "stamp", "unit": "ns"}})["speed"]
+    assert [time - NOON for time, _ in found] == pytest.approx(TIMES.tolist(), abs=1e-6)
+    with raises_saying(ConfigurationError, "none of its 50 rows", "'stamp'", "unit"):
+        samples(path, speed={"time": "stamp"})
+
+
+def test_dates_in_a_column_of_their_own_are_used(tmp_path: Path) -> None:
+    days = ["2026-03-29"] * 2 + ["2026-03-31"] * 2
+    clocks = ["11:59:59", "12:00:00", "12:00:00", "12:00:01"]
+    path = parquet_of(tmp_path, Date=days, Time=clocks, x=[1.0, 2.0, 3.0, 4.0])
+    times = [time - NOON for time, _ in samples(path, x={})["x"]]
+    assert times == [-1.0, 0.0, 2 * 86400.0, 2 * 86400.0 + 1.0]
+
+
+@pytest.mark.parametrize("segments", [["a", "a", "", "b"], [1, 1, 1, 2], [1.0, None, 1.0, 2.0]])
+def test_a_column_of_segments_splits_arrays(segments: list[Any], tmp_path: Path) -> None:
+    path = parquet_of(tmp_path, t=[0.0, 0.1, 0.2, 0.0], x=[1.0, 2.0, 3.0, 4.0], segment=segments)
+    signal = Signal(name="x", unit="1", source=arrays.Source())
+    with arrays.open_log(path, Setup((signal,), tmp_path, 0.01)) as reader:
+        assert [mark for rows in reader.chunks() for mark in rows.begins.tolist()] == [False, False, False, True]
+
+
+def test_dates_of_another_column_do_not_contradict_times_of_nanoseconds(tmp_path: Path) -> None:
+    moments = np.datetime64("2026-03-29T12:00:00", "ns") + np.arange(3) * np.timedelta64(1, "s")
+    path = parquet_of(tmp_path, time=moments, Created=[f"2026-03-29 12:00:0{row}" for row in range(3)], x=[1.0] * 3)
+    assert [time - NOON for time, _ in samples(path, x={})["x"]] == [0.0, 1.0, 2.0]
+
+
+def test_moments_that_no_calendar_has_are_bad_rows(tmp_path: Path) -> None:
+    seconds = pa.array([-(10**15), 0, None, 10**15, 10**9], pa.timestamp("s"))
+    found = samples(parquet_of(tmp_path, time=seconds, x=[1.0, 2.0, 3.0, 4.0, 5.0]), bad=3, zone="Europe/Berlin", x={})
+    assert [value for _, value in found["x"]] == [2.0, 5.0]
+
+
+def test_rows_of_hdf5_may_have_texts_and_matrices(tmp_path: Path) -> None:
+    rows = np.zeros(3, dtype=[("x", "f8"), ("m", "f8", (2,)), ("s", "S25"), ("c", "c16")])
+    rows["x"], rows["s"] = [1.0, 2.0, 3.0], [f"2026-03-29T12:00:0{row}".encode() for row in range(3)]
+    path = hdf5_of(tmp_path, log=rows, info=np.zeros((), dtype=[("a", "f8")]))
+    assert samples(path, x={"time": "s"})["x"] == [(NOON, 1.0), (NOON + 1.0, 2.0), (NOON + 2.0, 3.0)]
+    for column in "mc":
+        with raises_saying(ConfigurationError, "no column", column):
+            samples(path, x={"column": column})
+
+
+def test_arrays_that_cannot_be_read_are_refused_with_their_names(tmp_path: Path) -> None:
+    with raises_saying(ConfigurationError, "'x' has 21 rows", "times"):
+        samples(hdf5_of(tmp_path, t=np.arange(20.0), x=np.arange(21.0)), x={})
+    with raises_saying(ConfigurationError, "'x'", "no rows"):
+        samples(parquet_of(tmp_path, t=np.zeros(0), x=np.zeros(0)), x={})
+    path = parquet_of(tmp_path, t=TIMES, x=SPEED)
+    packed = tmp_path / "run.parquet.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    with raises_saying(ConfigurationError, "run.parquet.gz", "unpack"):
+        samples(packed, x={})
+    data = bytearray(path.read_bytes())
+    data[20:80] = b"\xff" * 60
+    path.write_bytes(data)
+    with raises_saying(ConfigurationError, "run.parquet", "damaged"):
+        samples(path, x={})
+    table = pa.Table.from_arrays([pa.array(TIMES), pa.array(SPEED), pa.array(SPEED)], ["t", "x", "x"])
+    parquet.write_table(table, path)
+    with raises_saying(ConfigurationError, "several columns", "'x'"):
+        samples(path, x={})

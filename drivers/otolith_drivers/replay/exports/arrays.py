@@ -3,6 +3,7 @@
 The names of its columns are the header of a table, so the times are found, and asked about, as in a text.
 """
 
+import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,15 +19,16 @@ from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
 from otolith_drivers.common.time_zones import stated_zone
 from otolith_drivers.config_files import Range
-from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.errors import ConfigurationError, counted, nearest, shown
 from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
 from otolith_drivers.replay.exports.stores import STORES, ArrayTable, Moments
-from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, MergedReader, Reader, Rows, head_of
-from otolith_drivers.replay.table.cells import numbers
+from otolith_drivers.replay.readers import GZIP, MAX_TIME, Array, DataFile, Mask, MergedReader, Reader, Rows, head_of
+from otolith_drivers.replay.table.cells import changes, numbers
 from otolith_drivers.replay.table.header import TIME, Column, ColumnRequest, read_header
 from otolith_drivers.replay.table.options import TableOptions, TableSource
-from otolith_drivers.replay.table.times import Clock, TimeRequest, on_wall_clock, question_of_unit
+from otolith_drivers.replay.table.times import Clock, TimeRequest, on_wall_clock, question_of_unit, with_dates
 
+JUDGED = 5  # first rows, of which the times are judged
 ROWS = 50_000  # read at once; engineering choice: as a chunk of a text table
 
 keep_pandas_out()
@@ -59,12 +61,15 @@ def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> R
 
     if len(by_clock) < 2:
         return open_columns(list(signals))
+    by_clock = {f"times of {names[0]}": names for names in by_clock.values()}
     return MergedReader(path, by_clock, lambda clock: open_columns(by_clock[clock]), is_one_file=True)
 
 
 def tables_of(path: Path, opened: ExitStack) -> list[ArrayTable]:
     """The tables of a file; raise ConfigurationError if it is damaged, or has none."""
     head = head_of(path)
+    if path.suffix.lower() == GZIP:
+        raise ConfigurationError(f"{path}: a compressed file of arrays: unpack it")
     name, tables = next((store for start, store in STORES.items() if head.startswith(start)), ("", None))
     if tables is None:
         raise ConfigurationError(f"{path}: is not what its name says: unpack it if it is compressed")
@@ -112,13 +117,14 @@ class ArrayReader(Reader):
         """``units`` has the unit of each signal, and the range of an input in ordinary operation."""
         super().__init__(path)
         self._zone, self._opened = zone, ExitStack()
+        self._segment: str | None = None  # Text of the present one; None until a row has one
+        self._read = self._rows = self._bad = self._blank = 0
         try:
             self._open(units, sources)
         except BaseException:
             self._opened.close()
             raise
         self._times = EvenTimes()
-        self._read = self._rows = self._bad = self._blank = 0
 
     def _open(self, units: Mapping[str, tuple[str, Range | None]], sources: Mapping[str, TableSource]) -> None:
         tables = tables_of(self.path, self._opened)
@@ -131,16 +137,20 @@ class ArrayReader(Reader):
         self._even = None if stated is not None else self._table.times.get(next(iter(self._columns.values())))
         names = list(self._table.columns)
         wanted = {
-            name: ColumnRequest(self._columns[name], units[name][0], source.unit, *source.scaling)
+            name: ColumnRequest(_in_line(self._columns[name]), units[name][0], source.unit, *source.scaling)
             for name, source in sources.items()
         }
+        if self._even is None and len(names) == 1:
+            rows = counted(self._table.length, "row")
+            raise ConfigurationError(f"{self.path}: {shown(names[0])} has {rows}, but no column of times has: add it")
         text = self._text(names)
         if self._even is not None:  # its times are in no column
             names, request = [TIME, *(name for name in names if name != TIME)], TimeRequest(TIME, "s", is_known=True)
-            text = "sep=\t\n" + "\t".join([TIME, *map(self._cell, names[1:])]) + "\n"
+            text = _as_text([[TIME, *map(self._cell, names[1:])]])
         self._header = read_header(self.path, io.StringIO(text), wanted, request)
         self._names = names
-        self._clock = Clock(request or TimeRequest(), self._header.columns[TIME].scale, self._zone)
+        scale, has_dates = self._header.columns[TIME].scale, self._header.date is not None
+        self._clock = Clock(request or TimeRequest(), scale, self._zone, has_dates=has_dates)
         self.ignored = tuple(name for name, _, _ in self._header.others)
         self._no_readings = {}
         for name, source in sources.items():
@@ -150,16 +160,16 @@ class ArrayReader(Reader):
 
     def _text(self, names: Sequence[str]) -> str:
         """The header of the table as a text, with its first rows, of which the times are judged."""
-        lines = ["sep=\t", "\t".join(map(self._cell, names))]
+        lines = [list(map(self._cell, names))]
         if self._even is None:
-            part = next(self._table.parts(names, 5), {})
-            columns = [[str(value) for value in part[name].tolist()] for name in names] if part else []
-            lines += ["\t".join(row) for row in zip(*columns, strict=True)]
-        return "\n".join(lines) + "\n"
+            part = next(self._parts(names, JUDGED), {})
+            columns = [list(map(str, _shown(part[name]).tolist())) for name in names] if part else []
+            lines += map(list, zip(*columns, strict=True))
+        return _as_text(lines)
 
     def _cell(self, name: str) -> str:
         unit = self._table.columns[name]
-        return f"{name} [{unit}]".replace("\t", " ") if unit else name.replace("\t", " ")
+        return f"{name} [{unit}]" if unit else name
 
     def __exit__(self, *error: object) -> None:
         self._opened.close()
@@ -177,7 +187,9 @@ class ArrayReader(Reader):
     def chunks(self) -> Iterator[Rows]:
         columns = {name: self._names[column.place] for name, column in self._header.columns.items()}
         read = list(dict.fromkeys(name for key, name in columns.items() if key != TIME or self._even is None))
-        for part in self._parts(read):
+        beside = [place for place in (self._header.date, self._header.segment) if place is not None]
+        read = list(dict.fromkeys((*read, *(self._names[place] for place in beside))))
+        for part in self._parts(read, ROWS):
             count = len(part[read[0]])
             rows = self._rows_of(part, columns, count)
             self._read += count
@@ -187,11 +199,15 @@ class ArrayReader(Reader):
                 self._rows += len(rows.times)
                 yield from self._times.of(rows)
         yield from self._times.rest()
+        if not self._read:
+            raise ConfigurationError(f"{self.path}: {shown(self._names[-1])} and its other columns have no rows")
         if not self._rows:
-            raise ConfigurationError(f"{self.path}: none of its {self._read} rows has a time")
+            name = self._names[self._header.columns[TIME].place]
+            remedy = f"correct {shown(name)}, or write its unit or another column: table.time under [driver]"
+            raise ConfigurationError(f"{self.path}: none of its {self._read} rows has a time: {remedy}")
 
-    def _parts(self, names: Sequence[str]) -> Iterator[Mapping[str, NDArray[Any]]]:
-        parts = self._table.parts(names, ROWS)
+    def _parts(self, names: Sequence[str], rows: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+        parts = self._table.parts(names, rows)
         while True:
             try:
                 part = next(parts, None)
@@ -206,7 +222,7 @@ class ArrayReader(Reader):
         if self._even is not None:
             times: Array = np.asarray(self._even[0] + self._even[1] * (lines - 1.0))
         else:
-            times = self._seconds(part[columns[TIME]], self._header.columns[TIME])
+            times = self._seconds(part[columns[TIME]], self._header.columns[TIME], self._dates(part))
         timed = np.abs(times) <= MAX_TIME
         bad = self._bad + np.cumsum(~timed)
         self._bad = int(bad[-1]) if count else self._bad
@@ -218,18 +234,31 @@ class ArrayReader(Reader):
             values[name] = self._header.columns[name].scaled(written)
             asked = written if source.range is None else source.value(written)
             values[name][self._no_readings[name].among(asked)] = np.nan
-        return Rows(times[timed], values, lines[timed], bad[timed])
+        return Rows(times[timed], values, lines[timed], bad[timed], self._marks(part, timed))
 
-    def _seconds(self, cells: NDArray[Any], column: Column) -> Array:
+    def _marks(self, part: Mapping[str, NDArray[Any]], timed: Mask) -> Mask | None:
+        if self._header.segment is None:
+            return None
+        marks, self._segment = changes(_texts(part[self._names[self._header.segment]][timed]), self._segment)
+        return marks
+
+    def _dates(self, part: Mapping[str, NDArray[Any]]) -> pa.StringArray | None:
+        """The cells of the column with the dates, if that of the time has none."""
+        return None if self._header.date is None else _texts(part[self._names[self._header.date]])
+
+    def _seconds(self, cells: NDArray[Any], column: Column, dates: pa.StringArray | None) -> Array:
+        if dates is not None:
+            texts = with_dates(dates, _texts(cells))
+            return self._clock.times(column.scaled(numbers(texts, ".")), texts)
         if cells.dtype.kind == "M":
-            known = ~np.isnat(np.asarray(cells))
+            known = np.abs(np.asarray(cells).astype("datetime64[s]").astype(np.float64)) <= MAX_TIME
             times: Array = np.full(len(cells), np.nan)
             times[known] = np.asarray(cells)[known].astype("datetime64[us]").astype(np.float64) * 1e-6
             if not (isinstance(cells, Moments) and cells.has_zone):
                 times[known] = on_wall_clock(times[known], self._clock.dates)
             return times
         if cells.dtype == object:
-            texts = pa.array([str(cell) for cell in cells], pa.string())
+            texts = _texts(cells)
             return self._clock.times(column.scaled(numbers(texts, ".")), texts)
         written = _floats(cells)
         return self._clock.times(column.scaled(written), pa.array([""] * len(written)))
@@ -260,8 +289,32 @@ class ArrayReader(Reader):
 
 def _floats(cells: NDArray[Any]) -> Array:
     if cells.dtype == object:
-        return numbers(pa.array([str(cell) for cell in cells], pa.string()), ".")
+        return numbers(_texts(cells), ".")
     return np.asarray(cells).astype(np.float64)
+
+
+def _shown(cells: NDArray[Any]) -> NDArray[Any]:
+    """The cells with times of any unit as dates."""
+    return np.asarray(cells).astype("datetime64[us]") if cells.dtype.kind == "M" else cells
+
+
+def _texts(cells: NDArray[Any]) -> pa.StringArray:
+    return pa.array([str(cell) for cell in _shown(cells).tolist()], pa.string())
+
+
+def _in_line(name: str) -> str:
+    """A name as a cell of a header has it."""
+    return " ".join(name.split())
+
+
+def _as_text(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as a text table, whatever characters they have."""
+    text = io.StringIO()
+    text.write("sep=\t\n")
+    csv.writer(text, delimiter="\t", quoting=csv.QUOTE_ALL, lineterminator="\n").writerows(
+        map(_in_line, row) for row in rows
+    )
+    return text.getvalue()
 
 
 def _cause(error: BaseException) -> str:

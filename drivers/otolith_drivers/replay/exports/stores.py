@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith_drivers.errors import ConfigurationError, installation_of
+from otolith_drivers.errors import ConfigurationError, installation_of, shown
 
 Part = Mapping[str, NDArray[Any]]  # numbers, times (datetime64) or texts, by column
 MAX_MATRIX = 100  # columns of a matrix that are columns of a table; engineering choice
@@ -41,7 +41,7 @@ def parquet_tables(path: Path, opened: ExitStack) -> list[ArrayTable]:
             yield {name: _of_arrow(batch.column(name)) for name in columns}
 
     schema = file.schema_arrow
-    return [ArrayTable("", {field.name: _unit_of_field(field) for field in schema}, file.metadata.num_rows, parts)]
+    return [ArrayTable("", _arrow_columns(path, schema), file.metadata.num_rows, parts)]
 
 
 def feather_tables(path: Path, opened: ExitStack) -> list[ArrayTable]:
@@ -58,7 +58,27 @@ def feather_tables(path: Path, opened: ExitStack) -> list[ArrayTable]:
                 part = batch.slice(first, rows)
                 yield {name: _of_arrow(part.column(name)) for name in columns}
 
-    return [ArrayTable("", {field.name: _unit_of_field(field) for field in file.schema}, sum(lengths), parts)]
+    return [ArrayTable("", _arrow_columns(path, file.schema), sum(lengths), parts)]
+
+
+def _arrow_columns(path: Path, schema: Any) -> dict[str, str | None]:
+    """The units of the columns of numbers, times and texts; a nested column, or one of bytes, is none."""
+    columns = {field.name: _unit_of_field(field) for field in schema if _is_read(field.type)}
+    if twice := next((name for name in columns if schema.names.count(name) > 1), None):
+        raise ConfigurationError(f"{path}: several columns are called {shown(twice)}: give them names of their own")
+    return columns
+
+
+def _is_read(kind: Any) -> bool:
+    import pyarrow as pa  # noqa: PLC0415 - as above
+
+    types = pa.types
+    if types.is_dictionary(kind):
+        return _is_read(kind.value_type)
+    is_number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind) or types.is_decimal(kind)
+    is_time = types.is_timestamp(kind) or types.is_date(kind) or types.is_time(kind)
+    is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
+    return bool(is_number or is_time or is_text or types.is_null(kind))
 
 
 def _unit_of_field(field: Any) -> str | None:
@@ -80,9 +100,11 @@ def _of_arrow(column: Any) -> NDArray[Any]:
             count.fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False).view(f"datetime64[{kind.unit}]")
         )
         return Moments(moments, has_zone=kind.tz is not None)
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+    if pa.types.is_date(kind) or pa.types.is_time(kind):
+        column, kind = column.cast(pa.string()), pa.string()
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind):
         return np.array([text or "" for text in column.to_pylist()], dtype=object)
-    numbers: NDArray[Any] = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    numbers: NDArray[Any] = column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     return numbers
 
 
@@ -113,7 +135,9 @@ def hdf5_tables(path: Path, opened: ExitStack) -> list[ArrayTable]:
             return
         group, _, own = name.rpartition("/")
         if item.dtype.names:  # a table of rows
-            for column in item.dtype.names:
+            for column in item.dtype.names if item.ndim == 1 else ():
+                if item.dtype[column].kind not in "biufSO" or item.dtype[column].shape:
+                    continue
                 groups.setdefault((name, len(item)), {})[column] = (item, column)
             return
         if item.dtype.kind not in "biuf" or not 0 < item.ndim <= 2:
@@ -141,10 +165,18 @@ def _hdf5_table(group: str, length: int, found: Mapping[str, tuple[Any, Any]]) -
             part = {}
             for name in columns:
                 item, where = found[name]
-                part[name] = np.asarray(item[at][where] if isinstance(where, str) else item[where(at)])
+                part[name] = _decoded(np.asarray(item[at][where] if isinstance(where, str) else item[where(at)]))
             yield part
 
     return ArrayTable(group, {name: _unit_of_attributes(item) for name, (item, _) in found.items()}, length, parts)
+
+
+def _decoded(cells: NDArray[Any]) -> NDArray[Any]:
+    """Cells of bytes as texts."""
+    if cells.dtype.kind not in "SO":
+        return cells
+    texts = [cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell) for cell in cells.tolist()]
+    return np.array(texts, dtype=object)
 
 
 def _unit_of_attributes(item: Any) -> str | None:

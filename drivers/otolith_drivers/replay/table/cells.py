@@ -85,6 +85,18 @@ def numbers(texts: pa.StringArray, decimal: str) -> Array:
     return array
 
 
+def changes(texts: pa.StringArray, before: str | None) -> tuple[Mask, str | None]:
+    """Which cells have another text than the one above, and the last text; a blank cell repeats that above.
+
+    ``before`` is the text above all of them, None if there is none.
+    """
+    texts = pc.utf8_trim_whitespace(texts)
+    texts = pc.if_else(pc.match_substring_regex(texts, BLANK), pa.scalar(None, pa.string()), texts)
+    texts = pc.fill_null_forward(pa.concat_arrays([pa.array([before], pa.string()), texts]))
+    changed: Mask = pc.fill_null(pc.not_equal(texts[1:], texts[:-1]), False).to_numpy(zero_copy_only=False)
+    return changed, texts[-1].as_py()
+
+
 def other_sign(text: str, decimal: str) -> str:
     """A clause for a cell that is a number but for its decimal sign."""
     return f", but {decimal!r} is the decimal sign of other cells" if decimal and is_number(text) else ""

@@ -12,13 +12,14 @@ from otolith_drivers.replay.cleaning import NoReadings
 from otolith_drivers.replay.readers import MAX_TIME, Array, Integers, Mask, Rows
 from otolith_drivers.replay.table.cells import (
     ambiguous_cell,
+    changes,
     decimal_sign,
     has_text,
     numbers,
     other_sign,
     text_of,
 )
-from otolith_drivers.replay.table.header import BLANK, TIME, Header, split_quoted
+from otolith_drivers.replay.table.header import TIME, Header, split_quoted
 from otolith_drivers.replay.table.options import TableSource
 from otolith_drivers.replay.table.times import DATE, Clock, with_dates
 
@@ -168,13 +169,9 @@ class TableChunk:
         return {name: text if name == TIME else pc.if_else(is_none, "", text) for name, text in texts.items()}
 
     def _marks(self, texts: pa.StringArray) -> Mask:
-        """Which rows begin a segment: those with another text than the one above; a blank cell repeats that."""
-        texts = pc.utf8_trim_whitespace(texts)
-        texts = pc.if_else(pc.match_substring_regex(texts, BLANK), pa.scalar(None, pa.string()), texts)
-        texts = pc.fill_null_forward(pa.concat_arrays([pa.array([self._counts.segment], pa.string()), texts]))
-        self._counts.segment = texts[-1].as_py()
-        changed: Mask = pc.fill_null(pc.not_equal(texts[1:], texts[:-1]), False).to_numpy(zero_copy_only=False)
-        return changed
+        """Which rows begin a segment."""
+        marks, self._counts.segment = changes(texts, self._counts.segment)
+        return marks
 
     def _split(self, *, quoted: bool, is_cut: bool) -> pa.ListArray:
         """The cells of each line; those that a row lacks at its end are blank, but not in a line that is cut off."""

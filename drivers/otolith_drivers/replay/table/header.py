@@ -131,7 +131,7 @@ def read_header(
         number += 1
         check_length(f"{path}:{number}", len(line))
         is_comment = line.lstrip().startswith("#")
-        if excel := EXCEL_SEPARATOR.fullmatch(line.strip()):
+        if excel := EXCEL_SEPARATOR.fullmatch(line.strip(" \r\n")):
             separator = excel[1]
         if excel or not line.strip(" #\r\n"):
             continue
