@@ -271,6 +271,8 @@ def _rounded_intervals(times: Array) -> tuple[float, float] | None:
     low, high = (float(steps[edges[at] : edges[at + 1]].mean()) for at in (first, first + 1))
     is_step = MIN_ROUNDING * low <= high - low <= low + _rounding_error(times)  # a longer interval is a gap
     is_whole = abs((ratio := low / (high - low)) - round(ratio)) < WHOLE  # both are whole numbers of steps
+    if round(ratio) == 1 and sizes[first + 1] < MIN_STEPS:  # twice the interval: a row is lost
+        return None
     return (
         (low, high) if is_step and is_whole and sizes[first : first + 2].sum() >= ROUNDED_SHARE * len(steps) else None
     )

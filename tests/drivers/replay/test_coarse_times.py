@@ -99,6 +99,16 @@ def test_times_that_no_regular_clock_rounds_are_kept(kind: str) -> None:
     assert clock.text() is None
 
 
+@pytest.mark.parametrize("lost", [(600,), (300, 301, 1100), (150, 400, 1000, 1900, 3500)])
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_a_few_lost_rows_are_no_coarse_clock(start: float, lost: tuple[int, ...]) -> None:
+    times, _ = regular(0.01)
+    times = np.round(np.delete(times, lost) + start, 3)
+    even, clock = spread(rows_at(times, signals(times, np.random.default_rng(SEED))))
+    assert even.tolist() == times.tolist()
+    assert clock.text() is None
+
+
 @pytest.mark.parametrize("offset", [0.00348, 0.01 / 3.0, 0.005, 0.008])
 def test_signals_that_come_in_turn_keep_their_times(offset: float) -> None:
     """Rows of two signals with one interval alternate: theirs are two intervals, as those of rounded times."""
