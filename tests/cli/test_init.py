@@ -4,11 +4,13 @@ import math
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from pyarrow import csv, parquet
 
 from otolith.cli.commissioning.draft.assignment import rank
 from otolith.cli.commissioning.draft.offers import Offer
@@ -64,6 +66,44 @@ def test_a_german_table_becomes_a_file_that_check_accepts(
     assert otolith("check", "--no-device", file).return_value == 0
     assert otolith("check", file, data).return_value == 0
     assert f"next: otolith commission '{file}' {data} --write" in text.splitlines()
+
+
+def as_parquet(table: Path) -> Path:
+    path = table.with_suffix(".parquet")
+    parquet.write_table(csv.read_csv(table), path)
+    return path
+
+
+def as_rows_of_values(table: Path) -> Path:
+    """The table with one value per row."""
+    path = table.with_name("long.csv")
+    header, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    cells = [(row[0], name, value) for row in rows for name, value in zip(header[1:], row[1:], strict=True)]
+    path.write_text("time,tag,value\n" + "".join(",".join(row) + "\n" for row in cells), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("form", [as_parquet, as_rows_of_values])
+def test_a_table_of_another_form_becomes_a_machine_file(
+    form: Callable[[Path], Path], tmp_path: Path, scenario: MotorScenario
+) -> None:
+    lines = ["t,U,I,n"]
+    for index, tick in enumerate(islice(simulate(scenario), 300)):
+        measured = [tick.measured[name] for name in ("ArmatureVoltage", "ArmatureCurrent", "RotorSpeed")]
+        lines.append(",".join(f"{number:.4f}" for number in (0.01 * index, *measured)))
+    table, file = tmp_path / "monday.csv", tmp_path / "drive.toml"
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    units = [part for unit in ("U=V", "I=A", "n=rad/s") for part in ("--unit", unit)]
+    otolith("init", file, "--csv", form(table), "--twin", "dc_motor_coulomb", *units)
+    assert tables(file)["driver"]["file"] == form(table).name
+    assert {source["column"] for source in tables(file)["signals"].values() if "column" in source} == {"U", "I", "n"}
+
+
+def test_a_text_in_blocks_is_refused_with_what_helps(tmp_path: Path) -> None:
+    data = tmp_path / "trace.csv"
+    data.write_text("[key]; [value]\n0.Variable; GVL.a\n0.Data;\n; 0; 1.5\n; 2; 2.5\n", encoding="utf-8")
+    with raises_saying(ConfigurationError, "trace.csv", "CODESYS", "replay.md"):
+        otolith("init", tmp_path / "new.toml", "--csv", data)
 
 
 def test_a_speed_without_a_unit_is_in_that_of_drives_and_marked(tmp_path: Path, scenario: MotorScenario) -> None:

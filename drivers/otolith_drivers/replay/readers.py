@@ -230,6 +230,10 @@ class Reader(ABC):
     def summary_lines(self) -> list[str]:
         """Counts of what was read and of what was bad, a few words each; the number of rows first."""
 
+    def assumptions(self) -> list[str]:
+        """What was assumed of the dates."""
+        return []
+
     @abstractmethod
     def warnings(self) -> list[str]:
         """What limits the trust in the data, a line each."""
@@ -258,6 +262,11 @@ def suffix_of(path: Path) -> str:
 def holds_frames(path: Path) -> bool:
     """Whether the file is a CAN log, which cannot be read without a description of its frames."""
     return _module_of(path) == CAN_LOG
+
+
+def holds_arrays(path: Path) -> bool:
+    """Whether the file has arrays instead of a text."""
+    return _module_of(path) == ARRAYS
 
 
 def _module_of(path: Path) -> str:

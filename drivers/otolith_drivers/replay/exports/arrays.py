@@ -277,9 +277,12 @@ class ArrayReader(Reader):
         rows = [f"{counted(self._rows, 'row')} read", counted(self._bad, "bad row")]
         return [*rows, f"{counted(self._blank, 'cell')} blank"]
 
+    def assumptions(self) -> list[str]:
+        return self._clock.dates.warnings()
+
     def warnings(self) -> list[str]:
         lines = [] if (coarse := self._times.text()) is None else [coarse]
-        lines += self._clock.dates.warnings()
+        lines += self.assumptions()
         if self._bad:
             lines.append(f"bad rows: {self._bad} have no time")
         for name, no_readings in self._no_readings.items():

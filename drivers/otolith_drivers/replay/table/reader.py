@@ -235,7 +235,6 @@ class TableReader(Reader):
         return [*parts, counted(counts.bad_cells, "bad cell"), f"{counted(counts.blank, 'cell')} blank"]
 
     def assumptions(self) -> list[str]:
-        """What was assumed of the dates."""
         return self._dates.warnings()
 
     def warnings(self) -> list[str]:

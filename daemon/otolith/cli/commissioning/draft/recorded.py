@@ -48,7 +48,8 @@ def table_offers(path: Path, folder: Path) -> OfferedSource:
         raise ConfigurationError(f"{path}: no column has numbers")
     duration = float(np.ptp(clock))
     left = [column.name for column in columns if column.name not in {offer.name for offer in offers}]
-    remarks = [f"no numbers in column {name}" for name in left] + (assumptions if left else warnings)
+    said = dict.fromkeys(assumptions if left else warnings)  # a reader of several says it for each
+    remarks = [*(f"no numbers in column {name}" for name in left), *said]
     driver = ("[driver]", 'type = "replay"', f"file = {toml_value(seen_from(path, folder))}")
     title = f"{path}: {counted(rows, 'row')} in {duration:.6g} s"
     return OfferedSource(title, driver, offers, duration, check=str(path), remarks=remarks)
