@@ -290,3 +290,14 @@ def test_arrays_that_cannot_be_read_are_refused_with_their_names(tmp_path: Path)
     parquet.write_table(table, path)
     with raises_saying(ConfigurationError, "several columns", "'x'"):
         samples(path, x={})
+
+
+def test_channels_of_tdms_have_one_origin_of_their_times(tmp_path: Path) -> None:
+    path = tmp_path / "run.tdms"
+    dated = {"wf_increment": 0.01, "wf_start_time": np.datetime64("2026-03-29T12:00:00")}
+    channels = [("speed", dated), ("torque", {"wf_increment": 0.02}), ("force", dated | {"wf_increment": 0.02})]
+    with TdmsWriter(path) as writer:
+        writer.write_segment([ChannelObject("run", name, TIMES, properties) for name, properties in channels])
+    assert len(samples(path, speed={}, force={})["force"]) == len(TIMES)
+    with raises_saying(ConfigurationError, "torque has no wf_start_time", "speed has one", "set it"):
+        samples(path, speed={}, torque={})

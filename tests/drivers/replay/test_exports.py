@@ -288,3 +288,12 @@ def test_no_row_of_twincat_is_taken_for_a_key(tmp_path: Path, title: str, indent
     rows = "".join(f"{indent}{number}\t{100 + number}\n" for number in range(5))
     found = samples(written(tmp_path, head + rows), speed={"of": "rpm"})
     assert [value for _, value in found["speed"]] == [100.0, 101.0, 102.0, 103.0, 104.0]
+
+
+@pytest.mark.parametrize("zone", ["", "Europe/Berlin"])
+def test_it_is_said_that_dates_of_a_labview_file_are_taken_as_utc(tmp_path: Path, zone: str) -> None:
+    path = written(tmp_path, LVM_HEAD + LVM_SEGMENT.format(unit="V"), "run.lvm")
+    signal = Signal(name="a", unit="V", source=TableSource())
+    with open_log(path, Setup((signal,), tmp_path, 0.01, timezone=zone)) as reader:
+        assert len(list(reader.chunks())) == 1
+        assert ("taken as UTC" in " ".join(reader.warnings())) is not zone.startswith("Europe")

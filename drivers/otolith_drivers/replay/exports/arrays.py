@@ -28,6 +28,7 @@ from otolith_drivers.replay.table.header import TIME, Column, ColumnRequest, rea
 from otolith_drivers.replay.table.options import TableOptions, TableSource
 from otolith_drivers.replay.table.times import Clock, TimeRequest, on_wall_clock, question_of_unit, with_dates
 
+MIN_UNIX = 1e8  # s: Unix times since 1973; no recording is so long
 JUDGED = 5  # first rows, of which the times are judged
 ROWS = 50_000  # read at once; engineering choice: as a chunk of a text table
 
@@ -49,16 +50,22 @@ def open_log(path: Path, setup: Setup, options: TableOptions | None = None) -> R
                    for name, source in sources.items()}  # fmt: skip
     with ExitStack() as opened:
         tables = tables_of(path, opened)
-    by_clock: dict[str, list[str]] = {}
+    by_clock, begins = dict[str, list[str]](), dict[str, float]()
     for name, source in sources.items():
         table, column = found(path, tables, source.column or name)
         clock = f"{table.name} {table.length} {source.time} {table.times.get(column)}"
         by_clock.setdefault(clock, []).append(name)
+        if source.time is None and column in table.times:
+            begins[name] = table.times[column][0]
 
     def open_columns(names: Sequence[str]) -> ArrayReader:
         units = {name: (signals[name].unit, signals[name].ordinary) for name in names}
         return ArrayReader(path, units, {name: sources[name] for name in names}, stated_zone(setup.timezone))
 
+    if len({begin >= MIN_UNIX for begin in begins.values()}) > 1:
+        with_date, without = max(begins, key=lambda name: begins[name]), min(begins, key=lambda name: begins[name])
+        both = f"{without} has no wf_start_time, but {with_date} has one"
+        raise ConfigurationError(f"{path}: {both}, so that their times cannot be compared: set it for both")
     if len(by_clock) < 2:
         return open_columns(list(signals))
     by_clock = {f"times of {names[0]}": names for names in by_clock.values()}

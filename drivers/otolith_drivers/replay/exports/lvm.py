@@ -137,4 +137,4 @@ class _LvmText:
             yield f"{written}\t{value.replace(self._decimal, '.')}\n"
 
 
-LVM = TextExport("a LabVIEW measurement file (LVM)", re.compile(r"LabVIEW Measurement\s*"), opened)
+LVM = TextExport("a LabVIEW measurement file (LVM)", re.compile(r"LabVIEW Measurement\s*"), opened, has_dates=True)

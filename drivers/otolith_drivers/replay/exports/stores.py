@@ -27,7 +27,6 @@ class ArrayTable(NamedTuple):
     parts: Callable[[Sequence[str], int], Iterator[Part]]  # Some columns, so many rows at a time
     times: Mapping[str, tuple[float, float]] = {}
     """By column: first time and interval, s, of one whose times are not in a column."""
-    are_absolute: bool = False  # Whether these times are Unix times
 
 
 def parquet_tables(path: Path, opened: ExitStack) -> list[ArrayTable]:
@@ -260,16 +259,15 @@ def _tdms_table(group: str, length: int, found: Mapping[str, Any]) -> ArrayTable
 
     units = {name: str(unit) if (unit := channel.properties.get("unit_string")) else None
              for name, channel in found.items()}  # fmt: skip
-    times, is_absolute = dict[str, tuple[float, float]](), False
+    times = dict[str, tuple[float, float]]()
     for name, channel in found.items():
         step = channel.properties.get("wf_increment")
         if step is None or not float(step) > 0.0:
             continue
         begin = channel.properties.get("wf_start_time")
         since = 0.0 if begin is None else float(np.datetime64(begin, "us").astype(np.int64)) * 1e-6
-        is_absolute |= begin is not None
         times[name] = since + float(channel.properties.get("wf_start_offset", 0.0)), float(step)
-    return ArrayTable(group, units, length, parts, times, is_absolute)
+    return ArrayTable(group, units, length, parts, times)
 
 
 def _require(path: Path, library: str, extra: str, kind: str) -> None:

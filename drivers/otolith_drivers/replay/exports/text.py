@@ -31,6 +31,7 @@ class TextExport(NamedTuple):
 
     Raises ConfigurationError: the text does not have it.
     """
+    has_dates: bool = False  # Whether its times count from dates on the clock of the plant
 
 
 class Lines:

@@ -158,6 +158,7 @@ class TableReader(Reader):
         scale, has_dates = self._header.columns[TIME].scale, self._header.date is not None
         clock = Clock(request or TimeRequest(self._header.clock), scale, zone, has_dates=has_dates)
         self._dates = clock.dates
+        self._dates.assumed(1 if form.export is not None and form.export.has_dates else 0)
         self._chunk = TableChunk(self._header, self.counts, clock, named, variable)
         self.ignored = tuple(name for name, _, _ in self._header.others)
         for name, source in named.items():
