@@ -297,3 +297,12 @@ def test_it_is_said_that_dates_of_a_labview_file_are_taken_as_utc(tmp_path: Path
     with open_log(path, Setup((signal,), tmp_path, 0.01, timezone=zone)) as reader:
         assert len(list(reader.chunks())) == 1
         assert ("taken as UTC" in " ".join(reader.warnings())) is not zone.startswith("Europe")
+
+
+def test_a_second_table_of_influx_has_the_same_order_of_columns(tmp_path: Path) -> None:
+    first = ",table,_time,_value,_field\n,0,2026-03-29T12:00:00Z,1.5,speed\n"
+    same = ",table,_time,_value,_field\n,1,2026-03-29T12:00:00Z,2.5,torque\n"
+    other = ",table,_time,_field,_value\n,1,2026-03-29T12:00:01Z,torque,3.5\n"
+    assert samples(written(tmp_path, first + "\n" + same), torque={}) == {"torque": [(NOON, 2.5)]}
+    with raises_saying(ConfigurationError, "table.csv", "line 4", "another header", "export"):
+        samples(written(tmp_path, first + "\n" + other), speed={})

@@ -35,6 +35,7 @@ class LongVariable(NamedTuple):
     name: str | None  # None if the column of values is read whichever variable it has: then it must be one
     validity: int | None = None
     series: int | None = None
+    others: frozenset[str] = frozenset()  # Names of other columns: a header between the rows has them in another order
 
 
 @dataclass(slots=True)
@@ -140,6 +141,10 @@ class TableChunk:
         """Which lines have the value of the variable; the names of all are kept for messages."""
         names = pc.utf8_trim_whitespace(pc.list_element(cells, variable.names))
         known = self._counts.names
+        if moved := variable.others & set(pc.unique(names).to_pylist()):
+            line = self._first + int(np.flatnonzero(pc.equal(names, min(moved)).to_numpy(zero_copy_only=False))[0])
+            fault = "another header between the rows has its columns in another order: export the tables apart"
+            raise ConfigurationError(f"{self._header.path}: near line {line}: {fault}")
         known |= set(pc.unique(names).to_pylist()[: MAX_NAMES - len(known)]) - NO_VARIABLE
         if variable.name is not None:
             own: Mask = pc.equal(names, variable.name).to_numpy(zero_copy_only=False)

@@ -176,7 +176,8 @@ class TableReader(Reader):
         if layout.names not in places:  # a signal is read from it
             return None
         validity = places.get(layout.validity or "") if layout.is_long else None
-        return LongVariable(places[layout.names], name, validity, places.get(layout.series or ""))
+        others = frozenset({layout.values or "", self._header.clock}) if layout.series else frozenset[str]()
+        return LongVariable(places[layout.names], name, validity, places.get(layout.series or ""), others)
 
     @property
     def progress(self) -> float:
