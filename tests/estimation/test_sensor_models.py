@@ -13,6 +13,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.data_checks import check_window
+from otolith.estimation.objective import converter_steps
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.sensor_models import SensorModel, is_driven_position, least_change, new_readings, shown_model
@@ -226,3 +227,12 @@ def test_a_sensor_model_is_of_an_output(tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(text, encoding="utf-8")
     with raises_saying(ConfigurationError, "dead_band", "input"):
         load_machine(tmp_path / "m.toml", with_driver=False)
+
+
+def test_a_stated_resolution_counts_beside_steps_that_were_learned_before_it_was_stated(tmp_path: Path) -> None:
+    """The learned state has the step of one converter; then a person writes that of another into the machine file."""
+    problem = load_machine(Path(__file__).parents[2] / "config/dc-motor.toml", with_driver=False).problem
+    (first, second), seed = (output.name for output in problem.base_model.outputs), np.random.default_rng(1)
+    window = Window.whole(0, 0.0, 0.01, (first, second), seed.standard_normal((100, 2)))
+    learned = replace(problem, steps=(0.01, 0.0), sensors=((second, SensorModel(resolution=0.5)),))
+    assert converter_steps(learned, window) == (0.01, 0.5)

@@ -335,7 +335,8 @@ def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
     values = (window.column(name)[~window.missing_in(name)] for name in outputs)
     shown = list(map(_plausible_step, values, problem.noise))
     stated = {name: sensor.resolution for name, sensor in problem.sensors}
-    before = problem.steps or tuple(stated.get(name, 0.0) for name in outputs)
+    earlier = problem.steps or (0.0,) * len(outputs)
+    before = (old or stated.get(name, 0.0) for name, old in zip(outputs, earlier, strict=True))
     steps = tuple(
         new if new and (not old or new < old * (1.0 - ADC_TOLERANCE)) else old
         for old, new in zip(before, shown, strict=True)
