@@ -41,7 +41,7 @@ from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, counted, nearest
-from otolith_drivers.units import Quantity, limit_values
+from otolith_drivers.units import Quantity, are_of_one_quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
 
 LIBRARY = Path(__file__).parent / "twin" / "library"
@@ -387,11 +387,20 @@ def _plan(
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)
-    rules = (*(Rule(**rule.model_dump(), is_own=True) for rule in file.rule), *load_rules(language))
+    rules = (
+        *(Rule(**rule.model_dump(), is_own=True) for rule in file.rule),
+        *(_with_units_of(twin, rule) for rule in load_rules(language)),
+    )
     commands = frozenset(row.name for row in twin.inputs if row.hold == "zoh")
     return MonitoringPlan(
         parameters, components, rules, language=language, timezone=zone, known=known, signals=signals, commands=commands
     )
+
+
+def _with_units_of(twin: Definition, rule: Rule) -> Rule:
+    """Return a packaged rule for the units in which ``twin`` writes the same quantities, as Nm."""
+    same = (site.unit for site in twin.sites for unit in rule.unit if are_of_one_quantity(site.unit, unit))
+    return rule.model_copy(update={"unit": tuple(dict.fromkeys((*rule.unit, *same)))})
 
 
 def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> frozenset[str]:

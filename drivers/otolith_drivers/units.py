@@ -313,6 +313,11 @@ def is_one_in_si(one: str, other: str) -> bool:
     return has_one_dimension and is_as_large and _dimensions(one) != _dimensions(other)
 
 
+def are_of_one_quantity(one: str, other: str) -> bool:
+    """Return whether units measure the same quantity, as Nm and mN*m do; N*m and J do not."""
+    return _dimensions(one) == _dimensions(other)
+
+
 def _dimensions(text: str) -> dict[str, float]:
     """Return the exponents of the dimensions of the factors with which a unit is written."""
     exponents = dict[str, float]()

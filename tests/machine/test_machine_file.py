@@ -178,6 +178,20 @@ def test_a_rule_of_the_machine_file_replaces_what_the_packaged_ones_state(own_ma
     assert diagnose(rules, below) == diagnose(load_rules(), below)
 
 
+@pytest.mark.parametrize("unit", ["Nm", "mN*m"])
+def test_rules_know_the_quantity_of_a_site_however_its_unit_is_written(own_machine: OwnMachine, unit: str) -> None:
+    """A user's own twin states its torques in Nm."""
+    twin = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
+    own = own_machine.machine.with_name("own-twin.toml")
+    own.write_text(twin.replace('through = "1/J", unit = "N*m"', f'through = "1/J", unit = "{unit}"'), encoding="utf-8")
+    text = own_machine.machine.read_text(encoding="utf-8")
+    own_machine.machine.write_text(text.replace('name = "dc_motor"', 'file = "own-twin.toml"'), encoding="utf-8")
+    plan = limits_of(own_machine, 'value = "6.5 ohm"')
+    features = FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=1.0)
+    features = replace(features, unit=plan.sites["shaft"].unit)
+    assert diagnose(plan.rules, features)["condition"] == "unbalanced shaft"
+
+
 def test_of_the_own_rules_those_with_most_keys_count(own_machine: OwnMachine) -> None:
     stepped = RULE.replace('["above"]', '["above"]\nmanner = ["step"]').replace("aged motor cable", "broken strands")
     rules = limits_of(own_machine, 'value = "6.5 ohm"', RULE + stepped.replace("aged-cable", "broken-cable")).rules
