@@ -6,6 +6,7 @@ import pytest
 
 from otolith.discovery.alternatives import WindowDecision
 from otolith.estimation.information import Outcome
+from otolith.health.diagnosis import Rule
 from otolith.health.events import HealthState
 from otolith.health.limits import Level, Limit, MonitoredQuantity
 from otolith.health.schema import EventChange, FindingKind, FitDocument, ParameterDocument, Status
@@ -80,6 +81,17 @@ def test_an_early_signal_is_a_matter_of_the_machine_file(delay: float, level: Le
     state = replace(HealthState(), known_since=50.0)
     documents = assessed((report(index, findings=(late,)) for index in range(60, 66)), state)
     assert [item[2] for item in changes(documents)] == [level]
+
+
+@pytest.mark.parametrize(("kind", "subject"), [(FindingKind.TIMING, "A_valve"), (FindingKind.SENSOR, "i")])
+def test_a_rule_of_the_machine_file_says_itself_how_severe_its_finding_is(kind: FindingKind, subject: str) -> None:
+    """A delay of 20 ms is no error of 2 %; and a sensor that protects the machine may be off by no more than that."""
+    texts = {"condition": "c", "cause": "c", "advice": "a", "source": "s"}
+    own = Rule.model_validate({"id": "own", "finding": kind, "severity": "ACT", "is_own": True, **texts})
+    wrong = finding(kind, subject, 0.0).model_copy(update={"error": 0.02})
+    plan = replace(PLAN, rules=(own, *PLAN.rules))
+    documents = assessed((report(index, findings=(wrong,)) for index in range(6)), plan=plan)
+    assert [item[2] for item in changes(documents)] == [Level.ACT]
 
 
 def test_a_part_with_a_limit_that_nothing_was_judged_by_is_not_well() -> None:

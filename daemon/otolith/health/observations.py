@@ -8,7 +8,7 @@ from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.decision import INSIGNIFICANT, Approval
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import COMMAND, FindingFeatures, MonitoringPlan, severity
+from otolith.health.diagnosis import COMMAND, FindingFeatures, MonitoringPlan, matching, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, probability_beyond
 from otolith.health.prognosis import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith.health.schema import (
@@ -202,7 +202,9 @@ def _of_finding(
     level = severity(plan.rules, features)
     # A signal that is wrong by a share moves the parameters that are estimated from it by about that share. That of an
     # offset varies with the signal: what once was at ACT stays there.
-    is_small = finding.error is not None and abs(finding.error) < plan.act_distance
+    # What a rule of the machine file says holds as it is.
+    is_sensor = finding.kind is FindingKind.SENSOR and not any(rule.is_own for rule in matching(plan.rules, features))
+    is_small = is_sensor and finding.error is not None and abs(finding.error) < plan.act_distance
     if level is Level.ACT and is_small and before.get(finding.id) is not Level.ACT:
         level = Level.WATCH
     meaning, numbers = plan.signals.get(finding.subject, ""), None
