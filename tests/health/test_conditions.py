@@ -43,6 +43,13 @@ def test_each_rule_has_a_whole_page_and_the_docs_are_current(language: Language)
     assert (DOCS / name).read_text(encoding="utf-8") == markdown(pages, texts), f"make conditions writes {name}"
 
 
+def test_only_a_signal_is_early_or_late() -> None:
+    rules = load_rules()
+    seen = {page.id: page.texts["seen"] for page in pages_of([rule.id for rule in rules], rules, texts_in("en"))}
+    assert "The signal is early." in seen["early-signal"]
+    assert [name for name, text in seen.items() if "nominal value" in text and "signal is" in text] == []
+
+
 def test_what_the_data_do_not_distinguish_names_each_other() -> None:
     rules = load_rules()
     pages = {page.id: page for page in pages_of([rule.id for rule in rules], rules, texts_in("en"))}

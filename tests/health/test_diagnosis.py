@@ -61,6 +61,13 @@ def test_a_rule_of_another_machine_is_no_alternative_to_one_of_this_twin(name: s
         assert len({bool(rule.twin) for rule in rows}) <= 1, [rule.condition for rule in rows]
 
 
+@pytest.mark.parametrize("name", TWINS)
+def test_gas_is_looked_for_only_in_machines_that_move_a_liquid(name: str) -> None:
+    """A fan moves air: neither venting nor a level is there to be checked."""
+    (rule,) = matching(RULES, FindingFeatures(FindingKind.RETURNS, name))
+    assert (rule.id == "returns-of-a-fluid") == (name in {"pump", "hydraulic_actuator"})
+
+
 def test_every_kind_of_event_has_a_rule() -> None:
     for kind in set(FindingKind) - {FindingKind.OPEN, FindingKind.COMPONENT}:
         assert matching(RULES, FindingFeatures(kind))

@@ -114,7 +114,7 @@ def _seen(rule: Rule, texts: Texts) -> Iterable[str]:
         names = map(texts.translated, rule.subject) if is_place else rule.subject
         yield own["place" if is_place else "subject"].format(names=", ".join(names))
     if len(rule.side) == 1:
-        yield own[f"side_{rule.side[0]}"]
+        yield own[f"{'delay' if rule.finding is FindingKind.TIMING else 'side'}_{rule.side[0]}"]
     for manner in rule.manner:
         yield own[f"manner_{manner.replace(' ', '_')}"]
     if rule.family:
