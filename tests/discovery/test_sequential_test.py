@@ -9,7 +9,14 @@ from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.discovery.decision import AdoptedComponent, count_fading, decide
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis
 from otolith.discovery.same_statement import prune, without_insignificant
-from otolith.discovery.sequential_test import FilterEvidence, SequentialTest, WindowCounts, is_usable, join
+from otolith.discovery.sequential_test import (
+    MAX_OPEN_WINDOWS,
+    FilterEvidence,
+    SequentialTest,
+    WindowCounts,
+    is_usable,
+    join,
+)
 from otolith.estimation.evidence import LogEvidence
 from otolith.estimation.information import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior
@@ -124,6 +131,20 @@ def test_no_hypothesis_with_a_negative_mass_is_accepted(kind: FaultType, value: 
 @pytest.mark.parametrize(("inflation", "accepted"), [(1.2, True), (1.8, False)])
 def test_a_sudden_change_is_accepted_only_if_no_structure_is_left(inflation: float, *, accepted: bool) -> None:
     outcome = decide(of_moved(FaultType.PARAMETER, 1.3 * J.nominal, inflation), learned=10)
+    assert (outcome.decision is WindowDecision.STEPPED) == accepted
+
+
+@pytest.mark.parametrize(
+    ("leading", "is_explained", "accepted"),
+    [(MAX_OPEN_WINDOWS - 1, True, False), (MAX_OPEN_WINDOWS, True, True), (MAX_OPEN_WINDOWS, False, False)],
+)
+def test_what_the_twin_always_leaves_does_not_hold_up_a_sudden_change_for_ever(
+    leading: int, *, is_explained: bool, accepted: bool
+) -> None:
+    """Slow errors of sensors, within their noise, leave the same structure in every window of a healthy machine too."""
+    test = of_moved(FaultType.PARAMETER, 1.3 * J.nominal, inflation=1.8)
+    (best, null), counts = test.hypotheses, replace(test.counts, leading=leading)
+    outcome = decide(replace(test, hypotheses=(replace(best, is_explained=is_explained), null), counts=counts), 10)
     assert (outcome.decision is WindowDecision.STEPPED) == accepted
 
 

@@ -69,10 +69,12 @@ def _is_agreed(test: SequentialTest, row: AlternativeRow, kind: FaultType, *, is
     """Whether enough windows agree that a hypothesis of type ``kind`` is probable enough.
 
     If ``is_young``, few windows have updated the filter. Where even the best hypothesis leaves structure, the cause may
-    be none of the hypotheses: then no data are wrong, and no parameter has moved.
+    be none of the hypotheses: then no data are wrong, and no parameter has moved. A sudden change that explains windows
+    for as long as a test distinguishes causes is accepted beside what the twin always leaves.
     """
     best, needed = test.best, max(row.windows, row.windows_while_young if is_young else 0)
-    needs_all = row.is_of_data or row.decision is WindowDecision.STEPPED
+    is_lasting = test.counts.leading >= MAX_OPEN_WINDOWS and best.is_explained
+    needs_all = row.is_of_data or (row.decision is WindowDecision.STEPPED and not is_lasting)
     may_be = (row.is_of_data or best.type is kind) and not (needs_all and best.leaves_structure)
     return may_be and test.counts.leading >= needed and test.probability(kind) >= row.probability
 
