@@ -14,8 +14,8 @@ Filtering Theory, section 9.3).
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property, lru_cache
-from itertools import islice
+from functools import cached_property
+from itertools import islice, takewhile
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from otolith.estimation.evidence import Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.twin.kernel import Indices
 from otolith_drivers.units import unit_text
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
@@ -34,12 +33,13 @@ MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: with a wider one it is open whether the value is beyond the bound
 PRESSED = 3.0  # standard deviations by which a step without bounds must pass a bound: the value is beyond it
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
+MIN_INFLATED_COST = 1.1  # cost above which the residual is tested for autocorrelation: noise alone hardly reaches it
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
 NOISE_DRAWS = 8  # of the noise of inputs, by which its bias is estimated
 NEGLIGIBLE_BIAS = 0.02  # standard deviations of a window: a smaller bias is not corrected
 MIN_KEPT_INFORMATION = 0.5  # share of the information of a direction that is not by the noise of inputs; less is noise
 INFORMATION_OF_NOISE = 0.01  # share of the information of a direction that noise has determined: far less than stated
-CORRELATED = 3.0  # standard deviations of sums of autocovariances of white noise: what is smaller is chance
+CORRELATED = 2.0  # long-run variance over variance above which an autocorrelation is not chance
 WIDEN_BOUNDS = "widen the bounds in [parameters], or check the equations of the twin"
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
@@ -152,46 +152,25 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
 
 
 def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
-    """Return the factor on standard deviations for a residual larger than the noise, or correlated.
+    """Return the factor on standard deviations for a residual larger than the noise.
 
-    ``residuals`` (records, outputs) are whitened; those ``present`` count. What is correlated from sample to sample
-    does not average out, so the largest long-run variance of an output counts (W. K. Newey, K. D. West, Econometrica
-    55, 1987).
+    ``residuals`` (records, outputs) are whitened; those ``present`` count. What exceeds the noise is correlated from
+    sample to sample and does not average out, so its long-run variance counts (W. K. Newey, K. D. West, Econometrica
+    55, 1987), summed up to the first lag without correlation. White residuals show a correlation by chance, always of
+    one sign; up to that size their variance alone counts.
     """
-    columns = residuals.T if present.all() else [own[there] for own, there in zip(residuals.T, present.T, strict=True)]
-    long_run = max(cost**2, 1.0, *map(_long_run_variance, columns))
+    if cost <= MIN_INFLATED_COST:
+        return max(cost, 1.0)
+    long_run = cost**2
+    for column, measured in zip(residuals.T, present.T, strict=True):
+        series = column if measured.all() else column[measured]
+        records = len(series)
+        lags = range(1, max(int(MAX_LAG * records), 1))
+        covariances = (float(series[lag:] @ series[:-lag]) / records for lag in lags)
+        variance = float(series @ series) / max(records, 1)
+        total = variance + 2.0 * sum(takewhile(lambda covariance: covariance > 0.0, covariances))
+        long_run = max(long_run, total if total > CORRELATED * variance else variance)
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
-
-
-@lru_cache(maxsize=16)
-def _sums_of_lags(records: int) -> tuple[int, Indices, Array]:
-    """Return how many lags count in so many records, where the sums of them begin, and what chance makes of each."""
-    lags = int(MAX_LAG * records)
-    starts = 2 ** np.arange(max(lags - 1, 0).bit_length()) - 1
-    return lags, starts, CORRELATED * np.sqrt(np.diff(starts, append=lags - 1) / max(records, 1))
-
-
-def _long_run_variance(series: Array) -> float:
-    """Return the variance plus twice the autocovariances, of which white noise would show none.
-
-    They are summed over lags of 1, 2 to 3, 4 to 7 and so on. For white noise a sum of m lags of n values has the
-    standard deviation √(m/n) of the variance (M. S. Bartlett, 1946). Sums within ``CORRELATED`` of it are chance;
-    larger ones shrink as by the positive-part rule (W. James, C. Stein, 1961). A negative sum ends the correlation
-    (initial positive sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CORRELATED`` it does so by degrees.
-    """
-    records = len(series)
-    lags, starts, by_chance = _sums_of_lags(records)
-    variance = float(series @ series) / max(records, 1)
-    if lags < 2 or variance == 0.0 or not np.isfinite(variance):
-        return variance
-    spectrum = np.abs(np.fft.rfft(series, 2 ** (records + lags).bit_length())) ** 2
-    covariances = np.fft.irfft(spectrum)[1:lags] / (records * variance)
-    sums = np.add.reduceat(covariances, starts)
-    if (sums <= by_chance).all():
-        return variance
-    kept = np.minimum.accumulate(np.minimum(np.maximum(1.0 + sums / by_chance, 0.0), 1.0))
-    larger = np.maximum(sums, by_chance)
-    return variance * (1.0 + 2.0 * float(np.sum(kept * larger * (1.0 - (by_chance / larger) ** 2))))
 
 
 @dataclass(frozen=True, slots=True)
