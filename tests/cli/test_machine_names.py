@@ -71,7 +71,7 @@ def machine_arguments() -> Iterator[tuple[str, str]]:
         for part in command.commands.values() if isinstance(command, click.Group) else ():
             yield from walk(part, f"{name} {part.name}")
         for row in command.params:
-            if isinstance(row, click.Argument) and row.name in {"file", "machine", "recording"}:
+            if isinstance(row, click.Argument) and row.name in {"file", "machine", "recordings"}:
                 yield name, row.make_metavar(click.Context(command))
 
     yield from walk(cli, "otolith")
@@ -82,7 +82,7 @@ def test_every_command_that_takes_a_machine_says_that_it_takes_both() -> None:
     assert {"otolith watch", "otolith history", "otolith view", "otolith reset", "otolith baseline"} <= rows.keys()
     own = {"otolith init", "otolith twin check"}  # a new file; a twin
     assert {name: text for name, text in rows.items() if name not in own and not {"FILE", "MACHINE"} <= set(
-        text.strip("[]").split("|"))} == {}  # fmt: skip
+        text.strip("[].").split("|"))} == {}  # fmt: skip
 
 
 @pytest.mark.parametrize("find", [file_of, reader_of])

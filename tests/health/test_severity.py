@@ -26,9 +26,9 @@ from tests.health.test_events import (
 from tests.messages import assert_says
 
 
-@pytest.mark.parametrize(("length", "expected"), [(0.5, 6), (1.0, 3), (2.0, 3)])
+@pytest.mark.parametrize(("length", "expected"), [(0.25, 8), (0.5, 4), (1.0, 3), (2.0, 3)])
 def test_short_windows_must_agree_for_seconds(length: float, expected: int) -> None:
-    """Three windows of half a second are 1.5 s: a start takes longer."""
+    """Three windows of a quarter of a second are 0.75 s: a start takes longer."""
     documents = []
     for index in range(12):
         window = report(index).window.model_copy(update={"start": length * index, "end": length * (index + 1)})

@@ -40,7 +40,6 @@ from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.global_search import search_window
-from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
@@ -94,7 +93,7 @@ class NoiseLevel:
 
     @property
     def is_bound(self) -> bool:
-        """Whether the value is the end of its 95 % interval: the level may be anything below."""
+        """Whether the level may be anything below its value: then a percentage says nothing."""
         return self.remark == UPPER_BOUND
 
 
@@ -348,8 +347,7 @@ def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint
     columns = (column.tolist() for column in (guess.signal_noise, best.levels, best.sd, guess.variances.floor))
     for output, shown, value, sd, floor in zip(twin.outputs, *columns, strict=False):
         if shown > 0.0:
-            is_bound = value <= sd + floor
-            yield NoiseLevel(output.name, value + is_bound * QUANTILE * sd, sd, UPPER_BOUND if is_bound else "")
+            yield NoiseLevel(output.name, value, sd, UPPER_BOUND if value <= sd + floor else "")
         else:
             yield NoiseLevel(output.name, value, None, NEVER_MEASURED if np.isnan(shown) else CONSTANT)
 

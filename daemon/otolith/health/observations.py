@@ -24,7 +24,7 @@ from otolith.health.text import Texts, duration_text, forecast_text, interval_te
 from otolith_drivers.units import equation_text, quantity_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
-PERSISTENT_SECONDS = 3.0  # s for which they must, where windows are shorter than a second
+PERSISTENT_SECONDS = 2.0  # s for which they must, where windows are shorter than two thirds of a second
 INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
 MIN_RETURNS = 4  # changes among as many windows, of which each was gone before the next: one that comes and goes
@@ -242,7 +242,8 @@ def _of_parameter(
     level, limit = quantity.level(*referred, *_held(key, before, past))
     if limit is None:
         return Observation(key, quantity.part, level)
-    if max(abs(deviation), limit.excess(referred[0])) <= QUANTILE * referred[1]:  # it may be healthy
+    may_be_healthy = max(abs(deviation), limit.excess(referred[0])) <= QUANTILE * referred[1]
+    if may_be_healthy and level is before.get(key, Level.OK):
         return Observation(key, quantity.part, None)
     manner = _manner(parameter, deviation, past.steps.get(name, 0.0))
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
