@@ -320,11 +320,10 @@ def _in_line(name: str) -> str:
 def _as_text(rows: Sequence[Sequence[str]]) -> str:
     """Rows of cells as a text table, whatever characters they have."""
     text = io.StringIO()
-    text.write("sep=\t\n")
     csv.writer(text, delimiter="\t", quoting=csv.QUOTE_ALL, lineterminator="\n").writerows(
         map(_in_line, row) for row in rows
     )
-    return text.getvalue()
+    return "sep=\t\n" + text.getvalue()
 
 
 def _cause(error: BaseException) -> str:
