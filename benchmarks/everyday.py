@@ -5,8 +5,8 @@
 The plant has equations of its own, not those of a twin: a winding with a temperature, a bridge that can be disabled, a
 supply that sags, loads without a sensor. A row is healthy, or has a fault and what must be said of it. Right is a
 healthy run without an event, or an event that names the fault; honest is a class of causes, or that nothing explains
-it; everything else is wrong. False events are all of healthy runs, and those before a fault began. The exit code is 1
-if a run is wrong.
+it; everything else is wrong, also a wrong cause beside the right one. False events are all of healthy runs, and those
+before a fault began. The exit code is 1 if a run is wrong.
 """
 
 import json
@@ -167,16 +167,20 @@ def run(name: str, seed: int) -> Outcome:
             if event.change is EventChange.RAISED and not event.is_hint:
                 false += not situation.right or window.end <= situation.onset
         named |= {rule for event in report.document.open_events for rule in event.condition_id.split()}
-    return Outcome(
-        name, _verdict(situation, named), situation.seconds, false, covered, intervals, longest, tuple(story)
-    )
+    return Outcome(name, verdict(situation, named), situation.seconds, false, covered, intervals, longest, tuple(story))
 
 
-def _verdict(situation: Situation, named: set[str]) -> str:
-    """Return whether what was named at any time is right, honest or wrong; a healthy run must name nothing."""
-    if named & set(situation.right) or not (named or situation.right):
+def verdict(situation: Situation, named: set[str]) -> str:
+    """Return whether what was named at any time is right, honest or wrong; a healthy run must name nothing.
+
+    A wrong cause is wrong also where the right one is named before or after it, and so is a fault that is missed.
+    """
+    right = set(situation.right)
+    if named - right - HONEST:
+        return "wrong"
+    if named & right or not (named or right):
         return "right"
-    return "honest" if named <= HONEST else "wrong"
+    return "honest" if named else "wrong"
 
 
 @click.command(help=__doc__)
@@ -193,7 +197,7 @@ def main(options: Options, runs: int, only: str) -> None:
         table = Table("situation", "right", "honest", "wrong", "false events", "coverage", "slowest window")
         for name in names:
             own = [result for result in results if result.situation == name]
-            counts = [str(sum(item.verdict == verdict for item in own)) for verdict in ("right", "honest", "wrong")]
+            counts = [str(sum(item.verdict == kind for item in own)) for kind in ("right", "honest", "wrong")]
             table.add_row(name, *counts, *_numbers(own))
         healthy = [item for item in results if item.situation.startswith("healthy")]
         days = sum(item.seconds for item in healthy) / DAY
