@@ -459,6 +459,8 @@ def _with_temperature(
             fault = f'{parameter.name} has no temperature_coefficient: write one, like "0.393 %/K" of copper'
             context.fail((*where, "temperature"), fault)
     temperature, reference = table.temperature or "", table.reference_temperature
+    coldest, thermal_time = table.temperature_range, table.thermal_time_constant
+    quantity = replace(quantity, coldest=coldest, thermal_time=thermal_time)
     return replace(quantity, temperature_coefficient=coefficient, temperature=temperature, reference=reference)
 
 

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from otolith.acquisition.samples import Check
 from otolith.estimation.problem import AlgorithmName
 from otolith.health.diagnosis import OwnRule
+from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
 from otolith.twin.definition import Definition
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
@@ -128,6 +129,9 @@ class ParameterTable(LimitsTable):
     temperature_coefficient: RawQuantity = None  # Relative change per kelvin; without it that of the twin
     reference_temperature: Annotated[float, BeforeValidator(Quantity("K", 0.0, 5000.0))] = 293.15
     """K, for which value and limits are stated."""
+    temperature_range: Annotated[float, BeforeValidator(Quantity("K", 0.0, 500.0, difference=True))] = COLDEST
+    """By how much it may be colder than at the reference temperature, K, if that is not measured."""
+    thermal_time_constant: Annotated[float, BeforeValidator(Quantity("s", 1.0, 1e6))] = THERMAL_TIME
 
 
 class SignalTable(StrictModel):

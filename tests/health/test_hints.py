@@ -171,6 +171,7 @@ def test_what_to_do_has_no_line_of_the_machine_file() -> None:
 def test_only_rules_about_the_machine_file_are_hints() -> None:
     assert {rule.id for rule in load_rules() if rule.severity == "HINT"} == {
         "early-signal", "early-signal-from-start", "late-signal-from-start", "noise-from-start", "polled-command",
+        "winding-colder", "magnets-colder",
     }  # fmt: skip
 
 

@@ -8,22 +8,32 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.ring import MAX_OBSERVED_AGE, Rings
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.health.limits import Level, Limit, MonitoredQuantity
-from otolith.health.schema import EventDocument, ReportDocument
+from otolith.discovery.alternatives import WindowDecision
+from otolith.health.diagnosis import MonitoringPlan
+from otolith.health.events import HealthState, assess
+from otolith.health.limits import Level, Limit, MonitoredQuantity, coldness_after
+from otolith.health.schema import (
+    EventDocument,
+    ParameterDocument,
+    QualityDocument,
+    ReportDocument,
+    Status,
+    WindowDocument,
+)
 from otolith.health.text import announcements
-from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
+from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
 from otolith.runtime.replay import Replay, open_recorded
 from otolith_drivers.base import Sample
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.faults import Drift
+from otolith_drivers.plant.faults import Drift, Step
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from otolith_drivers.units import limit_values
 from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 
 COPPER, RISE, WINDOWS = 0.00393, 40.0, 60  # 1/K, K
 PERIOD, RECORDS = 0.01, 200
@@ -187,3 +197,103 @@ def test_a_temperature_without_a_signal_is_refused(own_machine: OwnMachine) -> N
     machine_with(own_machine, MEASURED)
     with raises_saying(ConfigurationError, "winding_temperature (K)", "missing", "[parameters]"):
         load_machine(own_machine.machine)
+
+
+COPPER_WINDING = MonitoredQuantity(
+    "winding",
+    "armature resistance",
+    "ohm",
+    6.5,
+    tuple(Limit(level, 6.5 * (1.0 - share), True) for level, share in ((Level.WATCH, 0.02), (Level.ACT, 0.05))),
+    temperature_coefficient=COPPER,
+)
+
+
+def judged(resistances: list[tuple[float, float]], quantity: MonitoredQuantity = COPPER_WINDING) -> list[Level]:
+    """Return the levels after estimates of a resistance (time in s, value in ohm), without what the cold explains."""
+    levels, colder = list[Level](), None
+    for time, value in resistances:
+        colder = coldness_after(quantity, colder, value, 0.006, (time - 2.0, time))
+        levels.append(quantity.level(*quantity.warmed(value, 0.006, colder.kelvin), Level.OK)[0])
+    return levels
+
+
+@pytest.mark.parametrize("kelvin", [5.0, 30.0, 50.0])
+def test_a_cold_start_accuses_no_winding(kelvin: float) -> None:
+    """A winding warms up from below its nominal temperature, which is not measured."""
+    times = np.arange(0.0, 3600.0, 2.0)
+    cold = 6.5 * (1.0 - COPPER * kelvin * np.exp(-times / 300.0))
+    assert set(judged(list(zip(times.tolist(), cold.tolist(), strict=True)))) == {Level.OK}
+
+
+def test_a_start_that_is_colder_than_the_range_allows_is_a_finding() -> None:
+    narrow = replace(COPPER_WINDING, coldest=10.0)
+    assert judged([(0.0, 6.5 * (1.0 - 10.0 * COPPER))], narrow) == [Level.OK]
+    assert judged([(0.0, 6.5 * (1.0 - 30.0 * COPPER))], narrow) == [Level.ACT]
+
+
+def test_what_a_running_machine_loses_within_minutes_is_a_finding() -> None:
+    """15 % in 1040 s, as of turns that short out one after another, while the machine runs; in a night it is the hall."""
+    times = np.arange(0.0, 1040.0, 2.0)
+    values = 6.5 * (1.0 - 0.15 * times / times[-1])
+    levels = judged(list(zip(times.tolist(), values.tolist(), strict=True)))
+    assert values[levels.index(Level.WATCH)] > 0.97 * 6.5
+    assert levels[-1] is Level.ACT
+    assert set(judged(list(zip((30.0 * times).tolist(), np.maximum(values, 5.8).tolist(), strict=True)))) == {Level.OK}
+
+
+def test_what_a_running_machine_loses_at_once_is_no_cold_and_stays_a_finding() -> None:
+    healthy, shorted = [(2.0 * at, 6.5) for at in range(20)], [(40.0 + 2.0 * at, 5.9) for at in range(3600)]
+    levels = judged(healthy + shorted)
+    assert set(levels[:20]) == {Level.OK}
+    assert set(levels[20:]) == {Level.ACT}
+
+
+@pytest.mark.parametrize(("rest", "expected"), [(10.0, Level.ACT), (600.0, Level.OK), (36_000.0, Level.OK)])
+def test_a_rest_explains_as_much_as_it_was_long_enough_for(rest: float, expected: Level) -> None:
+    """After a time constant a machine may be colder by 63 % of the range."""
+    cold = 6.5 * (1.0 - 30.0 * COPPER)
+    assert judged([(0.0, 6.5), (rest, cold)]) == [Level.OK, expected]
+
+
+def test_a_limit_that_is_passed_in_the_cold_says_so() -> None:
+    """The motor has started 10 K colder; then turns short out."""
+    cold = 6.5 * (1.0 - 10.0 * COPPER)
+    quantity = replace(COPPER_WINDING, limits=COPPER_WINDING.limits[1:])
+    plan = MonitoringPlan({"R_a": quantity}, rules=load_rules())
+    documents, state = [], HealthState()
+    for index in range(20):
+        state, document = assess(plan, state, estimated(index, cold if index < 10 else 0.85 * cold))
+        documents.append(document)
+    (event,) = events(documents)
+    assert event.state is Level.ACT
+    assert_says(event.text, f"{0.85 * cold:.3f}", "10 K colder")
+
+
+def estimated(index: int, value: float) -> ReportDocument:
+    """Return the report of a window that determines the resistance of the winding."""
+    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
+    window = WindowDocument(index=index, start=2.0 * index, end=2.0 * index + 2.0, records=200, quality=quality)
+    parameter = ParameterDocument(value=value, sd=0.006, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
+    decision = WindowDecision.LEARNED
+    parameters = {"R_a": parameter}
+    return ReportDocument(machine="m", site="s", twin="t", window=window, decision=decision, parameters=parameters)
+
+
+def test_a_cold_motor_is_one_hint_with_both_causes(own_machine: OwnMachine) -> None:
+    """The demo's motor 30 K colder than at its nominal value."""
+    drift = {"kind": "step", "parameter": "R_a", "start": "0 s", "amount": f"{-6.5 * COPPER * 30.0} ohm"}
+    scenario = load_scenario(EXAMPLES / "scenarios" / "demo.toml")
+    assert isinstance(scenario, MotorScenario)
+    ticks = simulate(scenario.model_copy(update={"faults": (Step.model_validate(drift),)}))
+    windows = []
+    for index in range(8):
+        rows = [[tick.measured[name] for name in SIGNALS.values()] for tick in islice(ticks, RECORDS)]
+        windows.append(Window.whole(index, index * PERIOD * RECORDS, PERIOD, tuple(SIGNALS), np.array(rows)))
+    documents = reports(machine_with(own_machine, ""), windows)
+    (event,) = [event for document in documents for event in document.events if event.change is not None]
+    assert (event.state, event.condition_id) == (Level.HINT, "winding-colder")
+    assert_says(event.text, "30 K colder", "no temperature is measured")
+    assert_says(event.condition, "colder", "short-circuited")
+    assert documents[-1].health is not None
+    assert documents[-1].health.state is Level.OK

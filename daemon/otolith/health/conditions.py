@@ -98,7 +98,7 @@ def _numbers(rule: Rule) -> dict[str, int]:
 
 
 def _state(rule: Rule, texts: Texts) -> str:
-    if rule.finding in LIMITS:
+    if rule.finding in LIMITS and rule.severity != "HINT":
         return texts.conditions["state_limit"]
     if rule.finding in (FindingKind.NO_DATA, FindingKind.NO_SOURCE):
         return texts.conditions[f"state_{_key(rule.finding)}"]

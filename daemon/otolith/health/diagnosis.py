@@ -49,7 +49,7 @@ class _Row(StrictModel):
     subject: tuple[str, ...] = ()
     unit: tuple[str, ...] = ()
     side: tuple[Literal["below", "above"], ...] = ()
-    manner: tuple[Literal["step", "trend", "from the start"], ...] = ()
+    manner: tuple[Literal["step", "trend", "from the start", "colder"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
     order: Range | None = None  # Lowest and highest order

@@ -13,10 +13,11 @@ from typing import Any
 from otolith.discovery.alternatives import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan, diagnose
-from otolith.health.limits import MACHINE, Level, MonitoredQuantity
+from otolith.health.limits import MACHINE, Coldness, Level, MonitoredQuantity
 from otolith.health.notes import Deed, OperatorNote, Shelf, ended_events, lasting, noted, of_event, shelved_until
 from otolith.health.observations import (
     BUS,
+    COLDER,
     OUTPUT,
     PERSISTENT_WINDOWS,
     RELEASE_WINDOWS,
@@ -25,6 +26,7 @@ from otolith.health.observations import (
     Observation,
     Past,
     Persistence,
+    coldness_of,
     is_determined,
     observe,
 )
@@ -110,6 +112,8 @@ class HealthState:
     """Windows in which the signals determined each parameter and were as the machine file says."""
     known_since: float | None = None
     """Service time, s, at which these were enough: what begins later is a change. None before."""
+    coldness: Mapping[str, Coldness] = field(default_factory=dict)
+    """What a lower temperature explains of the parameters that depend on one that is not measured."""
     document: HealthDocument | None = None  # The states in the report before
     dropped: tuple[EventDocument, ...] = ()
     """Events that nothing is known of any more, each with its ``reason``; the next report clears them."""
@@ -191,6 +195,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
     state = _with_agreement(replace(state, undetermined=undetermined), report)
+    state = replace(state, coldness=coldness_of(plan, state.coldness, report))
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events, absent = {}, list[EventDocument](), set[str]()
     shelves = lasting(state.shelves, state.notes, report.window.end)
@@ -250,6 +255,7 @@ def _observations(
     spans = {name: span(history) for name, history in state.histories.items()}
     held = {key: record.held for key, record in state.records.items()}
     past = Past(state.steps, spans, state.trends, state.undetermined, held, state.doubtful, state.known_since)
+    past = replace(past, coldness=state.coldness)
     shown = observe(plan, report, levels, past)
     return earlier | {item.key: item for item in shown}
 
@@ -294,7 +300,7 @@ def _with_agreement(state: HealthState, report: ReportDocument) -> HealthState:
 
 def _from_start(observed: Observation) -> Observation:
     """Return the observation of a condition that was never at OK: a parameter that is beyond its limit is no wear."""
-    if observed.features.finding is not FindingKind.LIMIT:
+    if observed.features.finding is not FindingKind.LIMIT or observed.features.manner == COLDER:
         return observed
     return replace(observed, features=replace(observed.features, finding=FindingKind.LIMIT_FROM_START))
 

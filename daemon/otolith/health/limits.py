@@ -16,6 +16,9 @@ from otolith_drivers.units import quantity_text
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
 MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
+COLDEST = 55.0  # K: ambient temperatures of machines, from -15 to 40 °C (IEC 60034-1)
+THERMAL_TIME = 600.0  # s: thermal time constant of a winding; those of motors of 0.1 to 100 kW are longer
+COOLING = 10.0 / 3600.0  # K/s: how fast the surroundings of a running machine become colder
 MACHINE = "machine"  # the part to which belongs what no part of the twin explains
 
 
@@ -69,6 +72,8 @@ class MonitoredQuantity:
     temperature_coefficient: float = 0.0  # Relative change per kelvin
     temperature: str = ""  # Signal of the temperature, K; empty if it is not measured
     reference: float = 293.15  # Temperature for which nominal value and limits are stated, K
+    coldest: float = COLDEST  # By how much it may be colder than at the nominal value, K
+    thermal_time: float = THERMAL_TIME  # Time constant with which its temperature changes, s
     is_example: bool = False  # Whether nominal is of the twin's example, which is another machine
     has_baseline: bool = False  # Whether nominal is a value from commissioning instead of that of the machine file
 
@@ -84,6 +89,20 @@ class MonitoredQuantity:
             return None
         factor = 1.0 + self.temperature_coefficient * (temperature - self.reference)
         return (value / factor, sd / factor) if factor > MIN_TEMPERATURE_FACTOR else None
+
+    def colder_by(self, value: float) -> float:
+        """Return by how much colder than at the nominal value it would be at ``value``, K, if nothing else has changed.
+
+        Zero if it does not depend on the temperature, or that is measured.
+        """
+        if self.temperature or not self.temperature_coefficient or not self.nominal:
+            return 0.0
+        return (1.0 - value / self.nominal) / self.temperature_coefficient
+
+    def warmed(self, value: float, sd: float, kelvin: float) -> tuple[float, float]:
+        """Return an estimate as it would be if it were ``kelvin`` warmer."""
+        factor = max(1.0 - self.temperature_coefficient * kelvin, MIN_TEMPERATURE_FACTOR)
+        return value / factor, sd / factor
 
     @property
     def has_limits(self) -> bool:
@@ -118,6 +137,35 @@ class MonitoredQuantity:
             if excess > reach or (was_passed and excess > -release - reach):
                 levels.append((limit.level, limit))
         return max(levels, key=lambda item: item[0].rank)
+
+
+@dataclass(frozen=True, slots=True)
+class Coldness:
+    """What a lower temperature explains of a parameter whose temperature is not measured."""
+
+    kelvin: float  # Below the temperature of the nominal value
+    time: float  # Of the window that showed it, s
+
+
+def coldness_after(
+    quantity: MonitoredQuantity, before: Coldness | None, value: float, sd: float, window: tuple[float, float]
+) -> Coldness:
+    """Return what a lower temperature explains of an estimate, after what it explained ``before``.
+
+    ``window`` has begin and end of the window that it is of, s. At the start it explains all that the range of the
+    temperature allows. A machine that runs becomes colder only with its surroundings; one that rested, or of which
+    nothing was known, as fast as its time constant lets it. What is beyond a limit all the same is no matter of the
+    temperature, and stays so.
+    """
+    start, time = window
+    kelvin = min(max(quantity.colder_by(value), 0.0), quantity.coldest)
+    if before is not None and time >= before.time:
+        rest = max(start - before.time, 0.0)
+        reach = quantity.coldest * -math.expm1(-rest / quantity.thermal_time) + COOLING * (time - before.time)
+        allowed = min(kelvin, before.kelvin + reach)
+        level, _ = quantity.level(*quantity.warmed(value, sd, allowed), Level.OK)
+        kelvin = allowed if level is Level.OK else min(kelvin, before.kelvin)
+    return Coldness(kelvin, time)
 
 
 def probability_beyond(limit: Limit, value: float, sd: float) -> float:

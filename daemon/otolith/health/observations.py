@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.decision import INSIGNIFICANT, Approval
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import COMMAND, FindingFeatures, MonitoringPlan, matching, severity
-from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, probability_beyond
+from otolith.health.limits import MACHINE, Coldness, Level, Limit, MonitoredQuantity, coldness_after, probability_beyond
 from otolith.health.prognosis import MIN_TREND_SPAN, SeenTrend, next_crossing
 from otolith.health.schema import (
     ComponentDocument,
@@ -30,6 +30,7 @@ RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine mov
 MIN_RETURNS = 4  # changes among as many windows, of which each was gone before the next: one that comes and goes
 LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
+MIN_COLDNESS = 1.0  # K: what is colder by less is not said
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
 DAEMON, OUTPUT = "daemon", "output/"  # part to which an output belongs that does not work, and begin of its key
@@ -42,6 +43,7 @@ PARTS = {
 }
 """Of the findings that are about no part of the twin."""
 FROM_START = "from the start"  # Manner of what was so before the signals agreed with the machine file for long
+COLDER = "colder"  # Manner of what a lower temperature explains
 BY_THE_TWIN = frozenset({FindingKind.UNEXPLAINED, FindingKind.RETURNS, FindingKind.COMPONENT, FindingKind.CLASS})
 """What only the comparison with the twin shows."""
 NOTHING = FindingFeatures(FindingKind.OPEN)
@@ -102,6 +104,7 @@ class Past:
     held: Mapping[str, float | None]  # Value of the limit that decided the level of each condition, by its key
     doubtful: tuple[int, ...] = ()  # See HealthState.doubtful
     known_since: float | None = None  # See HealthState.known_since
+    coldness: Mapping[str, Coldness] = field(default_factory=dict)  # See HealthState.coldness
 
 
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
@@ -120,7 +123,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     observations.append(_of_returns(plan, report, before, past.doubtful))
     for name, parameter in report.parameters.items():
         own = _of_parameter(plan, report, name, before, past)
-        observations += [own, _of_trend(plan, report, name, own.level, past)]
+        observations += [own, *_of_coldness(plan, report, name, past), _of_trend(plan, report, name, own.level, past)]
         observations.append(_of_lost(plan, report, name, parameter, past.undetermined.get(name, 0.0)))
     observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before, past) for component in report.components)
@@ -238,6 +241,8 @@ def _of_parameter(
     referred = quantity.referred(value or 0.0, sd or 0.0, report.window.observed or {}) if is_known else None
     if referred is None:
         return Observation(key, quantity.part, None)
+    shown, colder = referred, past.coldness.get(name)
+    referred = quantity.warmed(*referred, colder.kelvin) if colder else referred
     deviation = referred[0] - quantity.nominal
     level, limit = quantity.level(*referred, *_held(key, before, past))
     if limit is None:
@@ -249,12 +254,13 @@ def _of_parameter(
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
     texts = plan.texts
     against = texts("of_baseline") if quantity.has_baseline else ""
-    share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
+    share = f"{shown[0] / quantity.nominal - 1.0:+.1%}" if quantity.nominal else ""
     expected = forecast_text(parameter, report.window.end, texts.language)
     change = f" ({share}{against}{_at_temperature(quantity, texts)})" if share else ""
-    judged = interval_text(*referred, unit)
-    what = {"what": texts.translated(quantity.meaning), "name": name, "value": judged, "change": change}
-    ahead = {"expected": expected and f", {expected}", "warming": _warming(quantity, deviation, texts)}
+    value_shown = interval_text(*shown, unit)
+    what = {"what": texts.translated(quantity.meaning), "name": name, "value": value_shown, "change": change}
+    warming = _warming(quantity, deviation, texts) or _cooled(colder, texts)
+    ahead = {"expected": expected and f", {expected}", "warming": warming}
     text = texts("limit", **what, beside=_beside(limit, referred[0], unit, texts), **ahead)
     return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
 
@@ -268,6 +274,40 @@ def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
     """Return on which side of a limit a value is."""
     side = texts(limit.side if limit.excess(value) > 0.0 else "still_near")
     return texts("beside", side=side, limit=quantity_text(limit.value, unit, digits=4))
+
+
+def coldness_of(plan: MonitoringPlan, before: Mapping[str, Coldness], report: ReportDocument) -> dict[str, Coldness]:
+    """Return what a lower temperature explains of each parameter that depends on one that is not measured."""
+    coldness = dict(before)
+    for name, item in report.parameters.items():
+        quantity = plan.parameters.get(name, MonitoredQuantity())
+        is_known = item.value is not None and item.sd is not None and item.status in DETERMINED
+        if is_known and quantity.temperature_coefficient and quantity.limits and not quantity.temperature:
+            value, sd = item.value or 0.0, item.sd or 0.0
+            times = report.window.start, report.window.end
+            coldness[name] = coldness_after(quantity, before.get(name), value, sd, times)
+    return coldness
+
+
+def _of_coldness(plan: MonitoringPlan, report: ReportDocument, name: str, past: Past) -> Iterator[Observation]:
+    """Yield that a parameter is beyond a limit only if it is not colder than at its nominal value."""
+    quantity, parameter = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
+    colder, value, sd = past.coldness.get(name), parameter.value, parameter.sd
+    if colder is None or value is None or sd is None or parameter.status not in DETERMINED:
+        return
+    level, limit = quantity.level(value, sd, Level.OK)
+    explained, _ = quantity.level(*quantity.warmed(value, sd, colder.kelvin), Level.OK)
+    key, texts = f"colder/{name}", plan.texts
+    is_main = colder.kelvin >= MAIN_SHARE * quantity.colder_by(value)
+    if limit is None or explained is not Level.OK or not is_main:
+        yield Observation(key, quantity.part, Level.OK if level is Level.OK else None)
+        return
+    features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, COLDER)
+    what = {"what": texts.translated(quantity.meaning), "name": name, "value": interval_text(value, sd, parameter.unit)}
+    what |= {"kelvin": f"{quantity.colder_by(value):.2g}", "limit": quantity_text(limit.value, parameter.unit)}
+    text = texts("colder", **what)
+    setting = texts("write_temperature", name=name)
+    yield Observation(key, quantity.part, severity(plan.rules, features), features, text, setting=setting)
 
 
 def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, past: Past) -> Observation:
@@ -289,7 +329,8 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
     referred = quantity.referred(parameter.value, parameter.sd or 0.0, report.window.observed or {})
     if crossing is None or referred is None or not seen.is_lasting(now, length):
         return Observation(key, quantity.part, None)
-    if _warming(quantity, crossing.limit - quantity.nominal, plan.texts):
+    is_cooling = 0.0 < quantity.colder_by(crossing.limit) <= quantity.coldest
+    if is_cooling or _warming(quantity, crossing.limit - quantity.nominal, plan.texts):
         return Observation(key, quantity.part, Level.OK)
     side = "below" if crossing.limit < quantity.nominal else "above"
     features = FindingFeatures(FindingKind.TREND, report.twin, name, side, "trend")
@@ -336,6 +377,11 @@ def _warming(quantity: MonitoredQuantity, deviation: float, texts: Texts) -> str
         return ""
     kelvin = deviation / quantity.nominal / quantity.temperature_coefficient
     return texts("warming", kelvin=f"{kelvin:.3g}") if kelvin > 0.0 else ""
+
+
+def _cooled(colder: Coldness | None, texts: Texts) -> str:
+    """Return how much colder a parameter was taken to be when its limit was judged; empty without any."""
+    return texts("cooled", kelvin=f"{colder.kelvin:.2g}") if colder and colder.kelvin >= MIN_COLDNESS else ""
 
 
 def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> Iterator[Observation]:
