@@ -155,7 +155,7 @@ SITUATIONS = (
     _motor("winding, later unbalance", "short circuit", "ACT", _step("R_a", "-0.6 ohm"), _unbalance(4.5, 40.0)),
     _motor("winding, later current sensor", "short circuit", "ACT", _step("R_a", "-0.6 ohm"),
            faults.Gain.model_validate(_at(40.0, kind="gain", signal="ArmatureCurrent", factor="1.1"))),
-    _motor("winding from the first window", "nominal value that does not fit", "ACT", _step("R_a", "-0.6 ohm", 0.0)),
+    _motor("winding from the first window", "colder than at commissioning", "HINT", _step("R_a", "-0.6 ohm", 0.0)),
     _motor("unbalance from the first window", "unbalanced shaft", "ACT", _unbalance(4.5, 0.0)),
     Situation("motor: speed sensor 5 x noisier", partial(machine_of, "motor"), partial(noisier, 5.0),
               "sensor is noisier", "WATCH"),

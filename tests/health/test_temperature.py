@@ -233,7 +233,7 @@ def test_a_start_that_is_colder_than_the_range_allows_is_a_finding() -> None:
 
 
 def test_what_a_running_machine_loses_within_minutes_is_a_finding() -> None:
-    """15 % in 1040 s, as of turns that short out one after another, while the machine runs; in a night it is the hall."""
+    """15 % in 1040 s, as of turns that short out one after another, while a machine runs; in a night it is the hall."""
     times = np.arange(0.0, 1040.0, 2.0)
     values = 6.5 * (1.0 - 0.15 * times / times[-1])
     levels = judged(list(zip(times.tolist(), values.tolist(), strict=True)))
