@@ -1,6 +1,5 @@
 """The rules of the architecture: imports, sizes and names. Each rule fails when it is broken."""
 
-import ast
 import re
 import shutil
 import subprocess
@@ -77,16 +76,6 @@ def test_no_class_name_is_used_twice() -> None:
     names = [name for path in SOURCES
              for name in re.findall(r"^ *class (\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)]  # fmt: skip
     assert [name for name, count in Counter(names).items() if count > 1] == []
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "daemon/otolith/acquisition").glob("*.py")), ids=lambda path: path.name)
-def test_acquisition_does_without_large_libraries(path: Path) -> None:
-    """It runs in the daemon's main thread, whose imports while it runs cost the watchdog's time on a slow computer."""
-    tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-    modules = {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
-    tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-    modules |= {node.module or "" for node in tree if isinstance(node, ast.ImportFrom)}
-    assert {name.partition(".")[0] for name in modules} & {"scipy", "numba", "sympy", "rerun", "pyarrow"} == set()
 
 
 def test_the_can_driver_has_no_way_to_send() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.interpolate import CubicSpline
 
 from otolith.acquisition.bridging import (
     BridgedInput,
@@ -12,7 +11,6 @@ from otolith.acquisition.bridging import (
     InputSamples,
     LostIntervals,
     OtherSamples,
-    _spline,
     bridge,
     curve_variance,
     kind_of,
@@ -300,15 +298,6 @@ def test_lost_instants_beyond_the_limit_are_not_computed() -> None:
     lost = LostIntervals(np.array([0.0]), np.array([3600.0]), np.array([1e-9]))
     assert not len(lost.instants(0.0, 3600.0, 1000))
     assert lost.instants(0.0, 10.7e-9, 10) == pytest.approx(1e-9 * np.arange(1, 11))
-
-
-@pytest.mark.parametrize("count", [4, 5, 40, 1000])
-def test_the_spline_is_that_of_scipy(count: int) -> None:
-    """At irregular knots, and beyond the first and the last one."""
-    rng = np.random.default_rng(count)
-    knots, values = np.cumsum(rng.exponential(1.0, count) ** 2 + 1e-4), rng.standard_normal(count)
-    times = rng.uniform(knots[0] - 0.5, knots[-1] + 0.5, 500)
-    np.testing.assert_allclose(_spline(knots, values, times), CubicSpline(knots, values)(times), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("between", [0, 2])

@@ -14,6 +14,7 @@ from otolith.acquisition.window import Window
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
+from tests.acquisition.series import cut_next
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
 from tests.waiting import wait_for
@@ -57,7 +58,7 @@ def read_window(sampling: Sampling) -> float:
         def is_read() -> bool:
             """Whether the last window has most of its records, of which a busy computer skips some."""
             if windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic()):
-                windows.append(windower.cut(rings, 0.0))
+                windows.append(cut_next(windower, rings))
             return bool(windows) and all((~windows[-1].missing_in(name)).sum() > RECORDS / 2 for name in ("a", "b"))
 
         wait_for(is_read)

@@ -14,7 +14,7 @@ from otolith.acquisition.window import Array, GridSpan, Quality, Verdict
 from otolith.acquisition.windower import Windower
 from otolith.machine_file import WindowTable
 from otolith_drivers.base import Sampling
-from tests.acquisition.series import ramp
+from tests.acquisition.series import cut_next, ramp
 from tests.messages import assert_each_says
 
 PERIOD, RECORDS = 0.01, 200
@@ -30,8 +30,8 @@ def quality_of(*signals: Samples, limits: QualityLimits | None = None, begin: fl
     windower = Windower([plan for plan, _ in signals], RECORDS, PERIOD, limits)
     rings.deliver_columns({plan.name: (times + begin, np.sin(times)) for plan, times in signals})
     assert windower.begin(rings, begin + 3.0 * LENGTH, 3.0 * LENGTH)
-    windower.cut(rings, offset=0.0)
-    return windower.cut(rings, offset=0.0).quality
+    cut_next(windower, rings)
+    return cut_next(windower, rings).quality
 
 
 def output(times: Array, sampling: Sampling = Sampling.TRUE) -> Samples:
@@ -61,7 +61,7 @@ def test_a_command_whose_first_sample_comes_after_the_window_is_unknown_in_it() 
     rings.deliver_columns({"y": (GRID, np.sin(GRID))})
     assert windower.begin(rings, LENGTH, LENGTH)
     rings.deliver_columns({"u": (late, np.sin(late))})
-    first, second = (windower.cut(rings, offset=0.0).quality for _ in range(2))
+    first, second = (cut_next(windower, rings).quality for _ in range(2))
     assert first.verdict is Verdict.BAD
     assert first.reasons[0].startswith("no samples of u from t = 0 s for 2 s: is the source on")
     assert second.verdict is Verdict.GOOD
@@ -78,7 +78,7 @@ def test_same_time_limit_is_the_only_bound_of_samples_at_one_time(together: int)
             windower = Windower([SignalPlan("y")], RECORDS, PERIOD, replace(NO_LIMITS, same_time=limit))
             rings.deliver_columns({"y": (times, readings)})
             assert windower.begin(rings, 3.0 * LENGTH, 3.0 * LENGTH)
-            quality = windower.cut(rings, offset=0.0).quality
+            quality = cut_next(windower, rings).quality
             assert (quality.verdict is Verdict.GOOD) == is_good
             if not is_good:
                 assert quality.reasons[0].startswith(

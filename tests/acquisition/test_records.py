@@ -8,8 +8,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from otolith.acquisition.playback import Playback
-from otolith.acquisition.records import EARLY, ON_GRID, Records, lies_on_grid, make_records, phase_of_grid
-from otolith.acquisition.samples import Series, SignalPlan, finite_samples, merge_equal_times
+from otolith.acquisition.records import Records, make_records
+from otolith.acquisition.samples import (
+    EARLY,
+    ON_GRID,
+    Series,
+    SignalPlan,
+    finite_samples,
+    lies_on_grid,
+    merge_equal_times,
+    phase_of_grid,
+)
 from otolith.acquisition.window import Array, GridSpan, Verdict, Window
 from otolith_drivers.base import Sampling
 from otolith_drivers.replay.readers import Rows

@@ -8,6 +8,7 @@ from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.window import Array, Window
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling
+from tests.acquisition.series import cut_next
 
 RECORDS, PERIOD = 200, 0.01
 PHASE = 0.0043  # s by which the second node samples after the first
@@ -57,7 +58,7 @@ def cut(plans: tuple[SignalPlan, ...], samples: list[tuple[Array, Array]]) -> li
     windows = []
     assert windower.begin(rings, 0.0, 0.0)
     while windower.due(rings, 0.0):
-        windows.append(windower.cut(rings, 0.0))
+        windows.append(cut_next(windower, rings))
     return windows
 
 

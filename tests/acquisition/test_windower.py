@@ -13,7 +13,7 @@ from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.window import Verdict, Window
 from otolith.acquisition.windower import GRACE_PERIOD, Windower
 from otolith_drivers.base import Sample, Sampling
-from tests.acquisition.series import ramp
+from tests.acquisition.series import cut_next, ramp
 from tests.messages import assert_each_says
 from tests.variants import often
 
@@ -43,7 +43,7 @@ def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -
         feed(rings, arrived)
         if windower.begin(rings, now, now):
             while windower.due(rings, now):
-                windows.append(windower.cut(rings, offset=1000.0))
+                windows.append(cut_next(windower, rings, offset=1000.0))
         now += 0.004
     return windows
 
@@ -117,7 +117,7 @@ def test_the_reason_names_an_input_that_never_comes() -> None:
         feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
         assert not windower.begin(rings, 0.4, 0.4)
         assert windower.begin(rings, 1.0, 1.0)
-        quality = windower.cut(rings, 0.0).quality
+        quality = cut_next(windower, rings).quality
         assert quality.verdict is (Verdict.BAD if hold else Verdict.GOOD)
         assert "; ".join(quality.reasons).startswith(reason)
 
@@ -140,7 +140,7 @@ def test_the_gap_limit_returns_with_the_fine_grid() -> None:
     windower.regrid(RECORDS, PERIOD)
     feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])
     assert windower.begin(rings, 1.0, 1.0)
-    reasons = windower.cut(rings, offset=0.0).quality.reasons
+    reasons = cut_next(windower, rings).quality.reasons
     assert "b has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons or (
         "a has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons
     )
@@ -193,7 +193,7 @@ def test_a_window_waits_for_a_delayed_signal() -> None:
     for now in np.arange(0.0, 4.0, 0.005):
         rings.deliver([Sample("a", now, now), Sample("b", now, now - delay)] if round(now / 0.005) % 2 == 0 else [])
         while windower.begin(rings, now, now) and windower.due(rings, now):
-            windows.append(windower.cut(rings, offset=0.0))
+            windows.append(cut_next(windower, rings))
     assert len(windows) >= 6
     for window in windows:
         assert not window.missing.any()
@@ -207,7 +207,7 @@ def test_a_window_waits_for_its_last_true_samples() -> None:
     for now in times:
         rings.deliver([Sample("a", now, now)])
         while windower.begin(rings, now, now) and windower.due(rings, now):
-            windows.append(windower.cut(rings, offset=0.0))
+            windows.append(cut_next(windower, rings))
     values = np.concatenate([window.column("a")[~window.missing_in("a")] for window in windows])
     assert values == pytest.approx(times[: len(values)])
     assert len(windows) >= 6
@@ -219,7 +219,7 @@ def test_samples_of_later_windows_that_are_overwritten_are_counted() -> None:
     windower = Windower(plans("a"), RECORDS, PERIOD)
     rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60)])
     assert windower.begin(rings, 0.6, 0.6)
-    windower.cut(rings, offset=0.0)
+    cut_next(windower, rings)
     rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60, 170)])
     assert rings.counters().overwritten == 170 - 100 - RECORDS
 
@@ -235,6 +235,6 @@ def test_the_grace_period_covers_the_next_sample_of_a_slow_input(interval: float
     )
     assert windower.begin(rings, 20.0, 20.0)
     for _ in range(4):
-        windower.cut(rings, offset=0.0)
+        cut_next(windower, rings)
     expected = min(max(1.5 * interval, GRACE_PERIOD), RECORDS * PERIOD)
     assert windower.grace == pytest.approx(expected if interval < 3.0 * RECORDS * PERIOD else GRACE_PERIOD)

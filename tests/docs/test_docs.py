@@ -92,7 +92,7 @@ def test_ci_calls_the_readmes_test_command() -> None:
     [
         ("otolith.cli.main", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic", "asyncio"}),
         ("otolith.adaptation.adapt", {"rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
-        ("otolith.runtime.service", {"numba", "rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
+        ("otolith.runtime.service", {"scipy", "numba", "rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
     ],
 )
 def test_nobody_loads_what_others_need(module: str, absent: set[str]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.cli.main import cli
 from otolith.health.schema import Report
@@ -28,14 +28,19 @@ from otolith.runtime.worker import (
     Preparation,
     Ready,
     Supervisor,
+    Task,
+    answer,
     perform,
 )
+from otolith_drivers.base import Counters, Link, SourceState
 from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.acquisition.series import uncut
 from tests.conftest import EXAMPLES
 from tests.estimation.test_window_fit import Cut, state_for
 from tests.waiting import PATIENCE, wait_for
 
 LENGTH = 2.0  # s of a window
+BAD = Quality(Verdict.BAD, 0.5, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture
@@ -73,9 +78,9 @@ def poll_until_missed(supervisor: Supervisor, count: int) -> None:
 
 
 def test_a_window_whose_worker_died_is_tried_again(supervisor: Supervisor, batch: list[Window]) -> None:
-    supervisor.submit(batch[0], time.monotonic())
+    supervisor.submit(Task(uncut(batch[0])), time.monotonic())
     poll_for_report(supervisor)
-    supervisor.submit(batch[1], time.monotonic())
+    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
     supervisor.worker.kill()
     assert poll_for_report(supervisor).document.window.index == 1
     assert (supervisor.missed, supervisor.restarts, supervisor.finished) == (0, 1, 2)
@@ -83,24 +88,48 @@ def test_a_window_whose_worker_died_is_tried_again(supervisor: Supervisor, batch
 
 def test_a_window_that_kills_two_workers_is_missed(supervisor: Supervisor, batch: list[Window]) -> None:
     invalid = replace(batch[0], signals=())  # raises an exception in the worker, which survives
-    supervisor.submit(invalid, time.monotonic())
+    supervisor.submit(Task(uncut(invalid)), time.monotonic())
     poll_until_missed(supervisor, 1)
     assert supervisor.restarts == 0
-    supervisor.submit(batch[1], time.monotonic())
+    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
     for _ in range(2):
         supervisor.worker.kill()
         supervisor.poll(time.monotonic())
     poll_until_missed(supervisor, 2)
-    supervisor.submit(batch[2], time.monotonic())
+    supervisor.submit(Task(uncut(batch[2])), time.monotonic())
     assert poll_for_report(supervisor).document.window.index == 2
 
 
+def test_samples_that_cannot_be_cut_cost_their_window_only(supervisor: Supervisor, batch: list[Window]) -> None:
+    raw = uncut(batch[0])
+    without = replace(raw, samples=replace(raw.samples, series={}))
+    supervisor.submit(Task(without), time.monotonic())
+    poll_until_missed(supervisor, 1)
+    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
+    assert poll_for_report(supervisor).document.window.index == 1
+    assert (supervisor.missed, supervisor.restarts, supervisor.finished) == (1, 0, 1)
+
+
+def test_the_worker_tells_which_sources_and_outputs_failed(batch: list[Window]) -> None:
+    """As the daemon knew it at the end of the window; and it counts windows of bad quality."""
+    drive = SourceState("drive", ("omega",), Link(up=False, reason="no answer"), Counters())
+    link, raw = Link(up=True, sources=(drive,)), uncut(batch[0])
+    result = answer(state_for("R_a"), Task(raw, link, {"history": "disk full"}))
+    assert result.window is not None
+    assert "no answer" in result.window.absent["drive"]
+    assert result.window.outages == {"history": "disk full"}
+    supervisor, worker = slow(batch)
+    worker.sent = [replace(result, window=replace(result.window, quality=BAD))]
+    assert len(supervisor.poll(1.0)) == 1
+    assert (supervisor.finished, supervisor.bad) == (1, 1)
+
+
 def test_a_worker_that_hangs_is_killed(supervisor: Supervisor, batch: list[Window]) -> None:
-    supervisor.submit(batch[0], time.monotonic())
+    supervisor.submit(Task(uncut(batch[0])), time.monotonic())
     poll_for_report(supervisor)
     os.kill(supervisor.worker._process.pid, signal.SIGSTOP)
     now = time.monotonic()
-    supervisor.submit(batch[1], now)
+    supervisor.submit(Task(uncut(batch[1])), now)
     supervisor.poll(now + WINDOW_TIMEOUT + 2 * LENGTH + 0.1)
     assert poll_for_report(supervisor).document.window.index == 1
     assert supervisor.restarts == 1
@@ -109,7 +138,7 @@ def test_a_worker_that_hangs_is_killed(supervisor: Supervisor, batch: list[Windo
 def test_windows_beyond_the_queue_are_missed(batch: list[Window]) -> None:
     supervisor = Supervisor(state_for("R_a"), length=LENGTH)
     for window in batch:
-        supervisor.submit(window, 0.0)
+        supervisor.submit(Task(uncut(window)), 0.0)
     assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
 
 
@@ -157,7 +186,7 @@ def test_windows_missed_during_compilation_are_logged_once(
 ) -> None:
     supervisor = Supervisor(state_for("R_a"), length=LENGTH)
     for window in batch:
-        supervisor.submit(window, 0.0)
+        supervisor.submit(Task(uncut(window)), 0.0)
     assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
     assert warnings == [f"window 0 missed: {NOT_READY}"]
@@ -182,6 +211,9 @@ class SlowWorker:
     def offer(self, _: object) -> bool:
         return True
 
+    def reset_backoff(self) -> None:
+        """Nothing was restarted."""
+
     def kill(self) -> None:
         self.killed += 1
 
@@ -189,7 +221,7 @@ class SlowWorker:
 def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
     supervisor, worker = Supervisor(state_for("R_a"), length=LENGTH), SlowWorker()
     supervisor.worker = worker  # type: ignore[assignment]  # has the methods that are used
-    supervisor.submit(batch[0], 0.0)
+    supervisor.submit(Task(uncut(batch[0])), 0.0)
     return supervisor, worker
 
 
@@ -308,7 +340,7 @@ def test_a_first_start_with_an_empty_cache(tmp_path: Path, monkeypatch: pytest.M
     supervisor = Supervisor(state, LENGTH)
     supervisor.start()
     values = np.random.default_rng(1).uniform(0.4, 0.6, (200, 2))
-    supervisor.submit(Window.whole(0, 0.0, 0.01, machine.twin.signals, values), time.monotonic())
+    supervisor.submit(Task(uncut(Window.whole(0, 0.0, 0.01, machine.twin.signals, values))), time.monotonic())
     try:
         wait_for(lambda: bool(supervisor.poll(time.monotonic())) or supervisor.missed > 0, 3 * PATIENCE)
     finally:

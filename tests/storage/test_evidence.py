@@ -29,7 +29,7 @@ from otolith.cli.main import cli
 from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, diagnose
 from otolith.health.schema import EventChange, FindingKind, Report
 from otolith.machine import load_machine
-from otolith.runtime.worker import Supervisor
+from otolith.runtime.worker import Supervisor, Task
 from otolith.storage import evidence
 from otolith.storage.evidence import (
     EVIDENCE,
@@ -47,6 +47,7 @@ from otolith.storage.learned_state import learned_state, restored
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario, simulate
+from tests.acquisition.series import uncut
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.storage.histories import event
 from tests.waiting import PATIENCE, wait_for
@@ -99,7 +100,7 @@ def bundles(batch: list[Window], tmp_path_factory: pytest.TempPathFactory) -> li
         supervisor.start()
         try:
             for window in batch:
-                supervisor.submit(window, time.monotonic())
+                supervisor.submit(Task(uncut(window)), time.monotonic())
                 wait_for(lambda: bool(supervisor.poll(time.monotonic())), 3 * PATIENCE)
         finally:
             supervisor.worker.kill()

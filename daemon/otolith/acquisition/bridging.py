@@ -249,7 +249,7 @@ def _line(samples: InputSamples, times: Array, steps: Array) -> tuple[Array, _Er
     variance = line_variance(series, samples.noise)(length)
     of_curve = curve_variance(series, samples.noise)
     if of_curve is not None:
-        curve, curve_error = _spline(series.times, series.values, times), of_curve(length)
+        curve, curve_error = _curve(series, times), of_curve(length)
         # In a long gap a curve is worse than a line; beside a burst of samples it overshoots.
         curved = inside & (curve_error < variance) & (np.abs(curve - values) <= CREDIBLE * np.sqrt(variance))
         values = np.where(curved, curve, values)
@@ -328,44 +328,15 @@ def _about_curve(series: Series, reach: int) -> Array:
         for first in range(pitch):
             knots = slice(first, None, pitch)
             middles = slice(first + reach, -reach, pitch)
-            errors.append(values[middles] - _spline(times[knots], values[knots], times[middles]))
+            errors.append(values[middles] - _curve(Series(times[knots], values[knots]), times[middles]))
     return np.asarray(np.concatenate(errors))
 
 
-def _spline(knots: Array, values: Array, times: Array) -> Array:
-    """Return the cubic spline through ``values`` at four or more ``knots``, at ``times``.
+def _curve(series: Series, times: Array) -> Array:
+    """Return the cubic spline through four or more samples, at ``times``."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - 34 MB that only smooth inputs need
 
-    Its third derivative is continuous at the second and the last but one knot, as in SciPy's ``CubicSpline``: de Boor,
-    "A Practical Guide to Splines", chapter IV. The daemon's main thread must not import SciPy: on a slow computer
-    that takes longer than the watchdog waits.
-    """
-    steps = np.diff(knots)
-    chords = np.diff(values) / steps
-    slopes = _knot_slopes(steps, chords)
-    place = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(steps) - 1)
-    step, chord, slope, after = steps[place], chords[place], slopes[place], times - knots[place]
-    bend = (slope + slopes[place + 1] - 2.0 * chord) / step
-    return np.asarray(values[place] + after * (slope + after * ((chord - slope) / step - bend + after * bend / step)))
-
-
-def _knot_slopes(steps: Array, chords: Array) -> Array:
-    """Return the slopes of a spline at its knots from the lengths and slopes between them: a tridiagonal system."""
-    first, last = steps[0] + steps[1], steps[-1] + steps[-2]
-    lower = [0.0, *steps[1:].tolist(), float(last)]
-    diagonal = [float(steps[1]), *(2.0 * (steps[:-1] + steps[1:])).tolist(), float(steps[-2])]
-    upper = [float(first), *steps[:-1].tolist()]
-    begin = ((steps[0] + 2.0 * first) * steps[1] * chords[0] + steps[0] ** 2 * chords[1]) / first
-    end = (steps[-1] ** 2 * chords[-2] + (2.0 * last + steps[-1]) * steps[-2] * chords[-1]) / last
-    middle = 3.0 * (steps[1:] * chords[:-1] + steps[:-1] * chords[1:])
-    slopes = [float(begin), *middle.tolist(), float(end)]
-    for row in range(1, len(slopes)):
-        factor = lower[row] / diagonal[row - 1]
-        diagonal[row] -= factor * upper[row - 1]
-        slopes[row] -= factor * slopes[row - 1]
-    slopes[-1] /= diagonal[-1]
-    for row in range(len(slopes) - 2, -1, -1):
-        slopes[row] = (slopes[row] - upper[row] * slopes[row + 1]) / diagonal[row]
-    return np.array(slopes)
+    return np.asarray(CubicSpline(series.times, series.values)(times))
 
 
 def _outdated(samples: InputSamples, times: Array) -> _Error:

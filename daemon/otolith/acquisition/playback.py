@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from otolith.acquisition.cutting import cut
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import SignalPlan, renewal
@@ -182,7 +183,6 @@ class Playback:
         """Begin anew with row ``at``, like a daemon that is started then."""
         old = self.windower
         self.windower = Windower(self._plans, old.records, old.sample_period, self._limits)
-        self.windower.counts = old.counts
         if math.isinf(self._step):
             self._step = median_step(rows.times)
         step = min(old.sample_period, self._step)
@@ -213,8 +213,10 @@ class Playback:
         self._checked = now
         begun = self.windower.begin(self._rings, now, now - self._begun)
         while begun and self.windower.due(self._rings, now):
-            window = self.windower.cut(self._rings, offset=0.0)
-            self.counts.repeated, self.counts.stale = self.windower.counts.repeated, self.windower.counts.stale
+            raw = self.windower.take(self._rings, offset=0.0)
+            window, stale = cut(raw)
+            self.counts.repeated += raw.samples.repeated
+            self.counts.stale += stale
             self._windows += 1
             yield replace(window, index=self._windows - 1)
 

@@ -5,12 +5,15 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from otolith.acquisition.records import Records
 from otolith.acquisition.samples import CyclicSeries, SignalPlan
 from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict
+
+if TYPE_CHECKING:  # slow to import
+    from otolith.acquisition.records import Records
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 CALENDAR = (1e8, 1e11)  # s: a time between them is Unix time and shown as a date
@@ -39,7 +42,7 @@ class Gap:
 
 
 def assess_quality(
-    records: Records,
+    records: "Records",
     plans: Mapping[str, SignalPlan],
     cyclic: Mapping[str, CyclicSeries],
     limits: QualityLimits,

@@ -20,12 +20,20 @@ from otolith.acquisition.bridging import (
     kind_of,
     lost_samples,
 )
-from otolith.acquisition.samples import Check, Indices, Interval, Series, SignalPlan, interval_of, stale_repeats
+from otolith.acquisition.samples import (
+    EARLY,
+    Check,
+    Indices,
+    Interval,
+    Series,
+    SignalPlan,
+    interval_of,
+    lies_on_grid,
+    stale_repeats,
+)
 from otolith.acquisition.window import Array, BridgeError, GridSpan, Mask, TimeGrid
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
-ON_GRID = 1e-3  # sample periods: distance of a true time from the grid that is rounding
-EARLY = 2.0 * ON_GRID  # sample periods before the window that belong to its first record: rounding on both sides
 SAME_TIME = 1e-6  # s below which two samples belong to one record
 NO_OTHERS = OtherSamples(np.zeros(0), Interval(np.inf, np.inf))
 MAX_LOST_RECORDS = 4  # records of the grid: more lost instants of an input than that get no records
@@ -43,21 +51,6 @@ class Records:
     held: frozenset[str]  # Commands that are recorded only when they change
     unknown: frozenset[str]  # Inputs that have no sample before the end of the window
     ambiguous: Mapping[str, float] = field(default_factory=dict)  # Share of samples with time but not value of another
-
-
-def lies_on_grid(times: Array, start: float, period: float) -> bool:
-    """Whether all ``times`` (n,), s, are on the grid ``start + k * period`` up to rounding."""
-    slots = (times - start) / period
-    return bool((np.abs(slots - np.rint(slots)) <= ON_GRID).all())
-
-
-def phase_of_grid(times: Array, start: float, period: float) -> float | None:
-    """Return by how much the grid must move so that all ``times`` (n,), s, are on it; None if they are on no grid."""
-    if len(times) < 2:
-        return None
-    turns = (times - start) / period
-    phase = float(np.angle(np.exp(2j * np.pi * turns).mean())) / (2.0 * np.pi)
-    return phase * period if lies_on_grid(times, start + phase * period, period) else None
 
 
 def without_stale(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], start: float) -> dict[str, Series]:

@@ -40,6 +40,8 @@ MAX_CLOCK_JITTER = 0.25  # of its period: standard deviation of the arrivals abo
 MAX_PHASE_ERROR = 0.05  # sample periods by which a delayed signal may be off the grid and still count as on it
 MIN_CLOCK_SAMPLES = 4  # samples from which the clock of a signal with another period can be estimated
 MAX_CLOCK_SLOTS = 100  # per sample: with more of them the arrivals have no clock
+ON_GRID = 1e-3  # sample periods: distance of a true time from the grid that is rounding
+EARLY = 2.0 * ON_GRID  # sample periods before the window that belong to its first record: rounding on both sides
 LAG_DEVIATIONS = 3.0  # standard deviations by which neighbouring intervals must be correlated to show a second sender
 
 Indices = NDArray[np.int64]
@@ -176,6 +178,21 @@ def interval_of(times: Array) -> Interval:
             return Interval(usual, LOST_INTERVAL * usual)
     long = float(np.quantile(intervals, LONG_QUANTILE))
     return Interval(float(np.median(intervals)), LONG_FACTOR * long)
+
+
+def lies_on_grid(times: Array, start: float, period: float) -> bool:
+    """Whether all ``times`` (n,), s, are on the grid ``start + k * period`` up to rounding."""
+    slots = (times - start) / period
+    return bool((np.abs(slots - np.rint(slots)) <= ON_GRID).all())
+
+
+def phase_of_grid(times: Array, start: float, period: float) -> float | None:
+    """Return by how much the grid must move so that all ``times`` (n,), s, are on it; None if they are on no grid."""
+    if len(times) < 2:
+        return None
+    turns = (times - start) / period
+    phase = float(np.angle(np.exp(2j * np.pi * turns).mean())) / (2.0 * np.pi)
+    return phase * period if lies_on_grid(times, start + phase * period, period) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

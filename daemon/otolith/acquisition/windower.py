@@ -1,15 +1,20 @@
-"""Cut consecutive windows out of the rings, without gap or overlap between them."""
+"""Take the samples of consecutive windows out of the rings, without gap or overlap between them.
+
+This follows the clocks of the sources only, which is quick. Records are made where the window is cut
+(:mod:`otolith.acquisition.cutting`), in another process.
+"""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.quality import QualityLimits, assess_quality
-from otolith.acquisition.records import EARLY, ON_GRID, lies_on_grid, make_records, phase_of_grid
+from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import (
+    EARLY,
+    ON_GRID,
     PUNCTUAL_QUANTILE,
     CyclicSeries,
     Series,
@@ -20,9 +25,11 @@ from otolith.acquisition.samples import (
     finite_samples,
     has_equal_times,
     has_period,
+    lies_on_grid,
     merge_equal_times,
+    phase_of_grid,
 )
-from otolith.acquisition.window import Array, GridSpan, Window
+from otolith.acquisition.window import Array, GridSpan
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
@@ -30,23 +37,33 @@ SLOW_GRACE = 1.5  # or so many intervals of the slowest input that needs its nex
 NO_SAMPLES = Series(np.zeros(0), np.zeros(0))
 
 
-@dataclass(slots=True)
-class WindowerCounts:
-    """Samples that no record has."""
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedSamples:
+    """The samples of each signal by its name, for a window."""
 
-    repeated: int = 0  # Samples at the time of another one
-    stale: int = 0  # Readings of a register that had not been renewed
+    series: Mapping[str, Series]
+    cyclic: Mapping[str, CyclicSeries]  # Of the signals on the grid or with a clock
+    repeated: int  # Samples of the window at the time of another one, which no record has
+    ambiguous: Mapping[str, float]
+    """Share of the samples of the window that have the time, but not the value of another one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _AlignedSamples:
-    """The samples of each signal by its name, for a window."""
+class RawWindow:
+    """The samples in and around a stretch of time, each with the time of its clock: a window that is not cut yet.
 
-    series: dict[str, Series]
-    cyclic: dict[str, CyclicSeries]  # Of the signals on the grid or with a clock
-    repeated: int  # Samples of the window at the time of another one
-    ambiguous: dict[str, float]
-    """Share of the samples of the window that have the time, but not the value of another one."""
+    Frozen and picklable.
+    """
+
+    index: int
+    span: GridSpan  # In monotonic time
+    offset: float  # Time of windows minus monotonic time, s
+    ahead: float  # Unix time minus the time of windows, s
+    samples: AlignedSamples
+    plans: Mapping[str, SignalPlan]
+    limits: QualityLimits
+    observed: Mapping[str, float]
+    """Mean over the window of each signal that only the judgement of the estimates needs."""
 
 
 class Windower:
@@ -61,7 +78,6 @@ class Windower:
         self.records = records
         self.sample_period = sample_period
         self.latency = 0.0  # s; by which samples arrive after their times because the source sends many at once
-        self.counts = WindowerCounts()
         self._limits = limits or QualityLimits()
         self._source_of_grid = next((plan.source for plan in plans if plan.is_cyclic), None)
         self.grace = GRACE_PERIOD  # Time after its end that the next window waits for late samples, s
@@ -114,8 +130,8 @@ class Windower:
         )
         return complete or now >= self.deadline
 
-    def cut(self, rings: Rings, offset: float, ahead: float = 0.0) -> Window:
-        """Return the next window.
+    def take(self, rings: Rings, offset: float, ahead: float = 0.0) -> RawWindow:
+        """Return the samples of the next window.
 
         ``offset`` is the time of windows minus monotonic time, and ``ahead`` Unix time minus the time of windows, s.
         """
@@ -123,28 +139,14 @@ class Windower:
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
             self._start += self._grid_shift(samples.cyclic, first=True)
             samples = self._align(rings)
-        records = make_records(samples.series, self.plans, self._span())
-        records = replace(records, ambiguous=samples.ambiguous)
-        window = Window(
-            index=self._index,
-            start=self._start + offset,
-            grid=records.grid,
-            signals=self.signals,
-            values=records.values,
-            missing=records.missing,
-            quality=assess_quality(records, self.plans, samples.cyclic, self._limits, self._span(offset + ahead)),
-            bridge_error=records.bridge_error,
-            observed=rings.observed_means(self._start, self.next_end),
-            ahead=ahead,
-        )
-        self.counts.repeated += samples.repeated
-        self.counts.stale += records.stale
+        observed = rings.observed_means(self._start, self.next_end)
+        raw = RawWindow(self._index, self._span(), offset, ahead, samples, self.plans, self._limits, observed)
         self.grace = self._next_grace(samples.series)
         self._index += 1
         self._start = self._start + self.length + self._grid_shift(samples.cyclic, first=False)
-        return window
+        return raw
 
-    def _grid_shift(self, aligned: dict[str, CyclicSeries], *, first: bool) -> float:
+    def _grid_shift(self, aligned: Mapping[str, CyclicSeries], *, first: bool) -> float:
         """Return by how much to move the grid, s: it follows one clock."""
         followed = {name: item for name, item in aligned.items() if self._has_clock_of_grid(self.plans[name])}
         return _grid_shift(followed, first=first, period=self.sample_period)
@@ -153,16 +155,16 @@ class Windower:
         """From the next window on, cut ``records`` records, ``sample_period`` s apart."""
         self.records, self.sample_period = records, sample_period
 
-    def _span(self, offset: float = 0.0) -> GridSpan:
-        """Return the next window, with times that are ``offset`` s later."""
-        return GridSpan(self._start + offset, self.records, self.sample_period)
+    def _span(self) -> GridSpan:
+        """Return the next window."""
+        return GridSpan(self._start, self.records, self.sample_period)
 
     def skip_to(self, start: float) -> None:
         """Let the next window start at ``start`` (s), after a time without samples."""
         if math.isfinite(self._start):
             self._start = max(self._start, start)
 
-    def _align(self, rings: Rings) -> _AlignedSamples:
+    def _align(self, rings: Rings) -> AlignedSamples:
         series, repeated, ambiguous = dict[str, Series](), 0, dict[str, float]()
         for name, plan in self.plans.items():
             series[name], merged = self._samples(rings, plan)
@@ -183,7 +185,7 @@ class Windower:
             elif self._is_on_grid(series[name]):
                 aligned[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
             series[name] = aligned[name].series if name in aligned else series[name]
-        return _AlignedSamples(series, aligned, repeated, ambiguous)
+        return AlignedSamples(series, aligned, repeated, ambiguous)
 
     def _has_clock_of_grid(self, plan: SignalPlan) -> bool:
         """Whether a signal comes from the source whose clock the grid follows: the first with cyclic signals."""
@@ -235,7 +237,7 @@ class Windower:
         if phase is not None and abs(phase) > ON_GRID * self.sample_period:
             self._start += phase if phase >= -EARLY * self.sample_period else phase + self.sample_period
 
-    def _next_grace(self, series: dict[str, Series]) -> float:
+    def _next_grace(self, series: Mapping[str, Series]) -> float:
         """Return how long to wait for the sample after the end of a window, s: a bridge needs both of its ends.
 
         A signal without two samples in sight has its last known interval.
@@ -247,7 +249,7 @@ class Windower:
         return float(np.clip(SLOW_GRACE * slowest, GRACE_PERIOD, max(self.length, GRACE_PERIOD)))
 
 
-def _grid_shift(aligned: dict[str, CyclicSeries], *, first: bool, period: float) -> float:
+def _grid_shift(aligned: Mapping[str, CyclicSeries], *, first: bool, period: float) -> float:
     """Return by how much to move the grid, in s, at most half a sample period.
 
     The clock of the source drifts against the monotonic clock. The lateness of the two halves of a window gives its

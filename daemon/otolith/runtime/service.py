@@ -1,6 +1,6 @@
 """The service: builds, starts, supervises and stops the parts of the daemon.
 
-    driver thread -> rings -> [main thread] window -> worker process -> [main thread] report -> Zenoh, recorder process
+    driver thread -> rings -> [main thread] samples -> worker process -> [main thread] report -> Zenoh, recorder process
 
 The main thread never waits for a machine, a worker, a disk, a command or a subscriber. It waits only for a process that
 it has killed and, at the end, for writer thread, recorder and commands, each up to its flush time.
@@ -23,7 +23,6 @@ from types import FrameType
 from typing import Any
 
 from otolith.acquisition.ring import Rings
-from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import (
     AdaptationState,
@@ -37,7 +36,7 @@ from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
 from otolith.health.labels import baseline_event, clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
-from otolith.health.status import absent_sources, driver_document, with_absent_sources
+from otolith.health.status import driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, load_machine
@@ -48,7 +47,7 @@ from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
 from otolith.runtime.effort import Effort
 from otolith.runtime.process import SIGNALS, EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.runtime.worker import COMPILE_TIMEOUT, Preparation, Supervisor
+from otolith.runtime.worker import COMPILE_TIMEOUT, Preparation, Supervisor, Task
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
@@ -182,7 +181,7 @@ class Service:
         ``clocks`` reads the clocks of the computer.
         """
         file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
-        self._machine, self._outputs = machine, {output.name for output in machine.twin.outputs}
+        self._machine = machine
         self._listen = file.zenoh.listen if listen is None else listen
         plans = machine.plans(machine.driver.sampling)
         self._rings = _rings(machine, max(plan.delay for plan in plans))
@@ -210,7 +209,7 @@ class Service:
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
         self._is_reload_due = False
-        self._windows = self._windows_bad = self._progress = 0
+        self._windows = self._progress = 0
         self._started_at = self._fed_at = 0.0
         self._stall = Effort()  # of the worker since its last progress
         self._summarised_at = -math.inf
@@ -371,11 +370,11 @@ class Service:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
     def _step(self) -> None:
-        """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
+        """Hand the samples of due windows to the worker, publish finished reports, supervise the processes."""
         now = time.monotonic()
         begun = self._windower.begin(self._rings, now, now - self._started_at)
         while begun and self._windower.due(self._rings, now):
-            self._cut(now)
+            self._take(now)
         wait(self._supervisor.worker.waitables, timeout=min(MAX_WAIT, max(MIN_WAIT, self._windower.next_end - now)))
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
@@ -400,9 +399,9 @@ class Service:
             StartDocument(site=identity.site, machine=identity.name, done=done, total=shown.total, text=shown.text)
         )
 
-    def _cut(self, now: float) -> None:
+    def _take(self, now: float) -> None:
         self._follow_wall_clock()
-        window = self._windower.cut(self._rings, self._clock.offset, self._clock.ahead)
+        raw = self._windower.take(self._rings, self._clock.offset, self._clock.ahead)
         link = self._machine.driver.link()
         self._windower.latency = link.latency
         self._adopt_achieved_period(link.period)
@@ -410,9 +409,7 @@ class Service:
         if decisions is not None:
             self._supervisor.revise(lambda state: self._decided(state, decisions))
         self._windows += 1
-        self._windows_bad += window.quality.verdict is Verdict.BAD
-        absent = absent_sources(link, window, self._outputs)
-        self._supervisor.submit(replace(window, absent=absent, outages=self._outages(now)), now)
+        self._supervisor.submit(Task(raw, link, self._outages(now)), now)
 
     def _outages(self, now: float) -> dict[str, str]:
         """Return the outputs that have failed for ``OUTAGE_AFTER``, and why; the machine is monitored without them."""
@@ -486,7 +483,7 @@ class Service:
             lost=driver.lost + rings.overwritten,
             reconnects=driver.reconnects,
             windows=self._windows,
-            windows_bad=self._windows_bad,
+            windows_bad=self._supervisor.bad,
             windows_missed=self._supervisor.missed,
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recorder.dropped,

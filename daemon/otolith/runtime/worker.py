@@ -1,29 +1,32 @@
-"""The worker process, which adapts to one window at a time, and its supervisor in the daemon.
+"""The worker process, which cuts one window at a time and adapts to it, and its supervisor in the daemon.
 
-The worker is stateless: it receives state and window, and returns the next state and the report. The state of record
+The worker is stateless: it receives state and samples, and returns window, next state and report. The state of record
 stays with the supervisor, so if a worker ends, at most the current window is lost. That window is tried once more; if
 its worker ends again, or if it takes too long, it is counted as missed.
 
-The daemon imports this module too, so the adaptation core with its compiler and optimiser is imported only in the
-functions that run in the worker.
+The daemon imports this module too, so what is large is imported only in the functions that run in the worker: the
+adaptation core with its compiler and optimiser, and SciPy, which bridges inputs.
 """
 
 import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from otolith import kernel_cache
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Verdict, Window
+from otolith.acquisition.windower import RawWindow
 from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
+from otolith.health.status import absent_sources
 from otolith.runtime.effort import Effort
 from otolith.runtime.process import ChildProcess
+from otolith_drivers.base import Link
 
 log = logging.getLogger(__name__)
 
@@ -37,10 +40,25 @@ NOT_READY = "the worker is starting; if the twin is new on this computer, it com
 
 
 @dataclass(frozen=True, slots=True)
+class Task:
+    """A window that is not cut yet, and what the daemon knew at its end."""
+
+    raw: RawWindow
+    link: Link = field(default_factory=lambda: Link(up=True))  # Of the machine
+    outages: Mapping[str, str] = field(default_factory=dict)  # See Window
+
+    @property
+    def index(self) -> int:
+        """Number of the window."""
+        return self.raw.index
+
+
+@dataclass(frozen=True, slots=True)
 class WorkerResult:
     """The next state and the report of a window; after a failure the unchanged state and no report."""
 
     window_index: int
+    window: Window | None  # None if it could not be cut
     state: AdaptationState
     report: Report | None
     seconds: float  # Computing time, s
@@ -52,7 +70,7 @@ class Ready(NamedTuple):
 
 
 def main(connection: Any, state: AdaptationState) -> None:
-    """Serve in the worker process: receive (state, window) and send a result, until None comes.
+    """Serve in the worker process: receive (state, task) and send a result, until None comes.
 
     Each step of a kernel is sent as well, and :class:`Ready` once.
     """
@@ -68,10 +86,23 @@ def main(connection: Any, state: AdaptationState) -> None:
         warm_up(state)
         connection.send(Ready())
         while (task := connection.recv()) is not None:
-            connection.send(perform(*task))
+            connection.send(answer(*task))
             if has_compiled:
                 kernel_cache.release_compiler()
                 has_compiled = False
+
+
+def answer(state: AdaptationState, task: Task) -> WorkerResult:
+    """Cut the window of a task and adapt to it; samples that cannot be cut cost this window only."""
+    from otolith.acquisition.cutting import cut  # noqa: PLC0415 - see the module's docstring
+
+    try:
+        window = cut(task.raw).window
+        absent = absent_sources(task.link, window, {output.name for output in state.problem.twin.outputs})
+    except Exception as error:
+        log.exception("window %d", task.index)
+        return WorkerResult(task.index, None, state, None, 0.0, f"{type(error).__name__}: {error}")
+    return perform(state, replace(window, absent=absent, outages=task.outages))
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:
@@ -85,7 +116,7 @@ def perform(state: AdaptationState, window: Window) -> WorkerResult:
     except Exception as error:  # any fault of the core: reported with the window, and the state stays as it was
         log.exception("window %d", window.index)
         failure = f"{type(error).__name__}: {error}"
-    return WorkerResult(window.index, state, report, time.perf_counter() - begun, failure)
+    return WorkerResult(window.index, window, state, report, time.perf_counter() - begun, failure)
 
 
 def warm_up(state: AdaptationState) -> str:
@@ -122,6 +153,7 @@ class Supervisor:
         self._keep = keep
         self.state = state  # State after the last finished window
         self.missed = 0
+        self.bad = 0  # Windows of bad quality
         self.finished = 0
         self.progress = 0  # Finished windows and compiled kernels
         self.is_compiling = True  # Whether the worker starts, or compiles or loads a kernel
@@ -131,8 +163,8 @@ class Supervisor:
         self._timeout = WINDOW_TIMEOUT + 2 * length
         self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
         self._effort = Effort()  # of the current window, or of a kernel
-        self._waiting: deque[Window] = deque()
-        self._current: Window | None = None
+        self._waiting: deque[Task] = deque()
+        self._current: Task | None = None
         self._retried: int | None = None
         self._last_reason = ""
 
@@ -167,7 +199,7 @@ class Supervisor:
         self.is_compiling, self._is_ready, self._prepared = True, False, []
         self.worker.start(self.state)
 
-    def submit(self, window: Window, now: float) -> None:
+    def submit(self, window: Task, now: float) -> None:
         """Queue a window, and dispatch it if the worker is free."""
         self._waiting.append(window)
         while len(self._waiting) > MAX_WAITING_WINDOWS:
@@ -217,10 +249,11 @@ class Supervisor:
             return None
         self._current, self.is_compiling = None, False  # a kernel that raised an exception has no end
         self.worker.reset_backoff()
+        self.bad += result.window is not None and result.window.quality.verdict is Verdict.BAD
         if result.report is None:
             self._miss(window, result.failure)
             return None
-        self._keep(self.state, window, result.report, result.state)
+        self._keep(self.state, result.window, result.report, result.state)
         self.state = result.state
         self.finished += 1
         self.progress += 1
@@ -252,7 +285,7 @@ class Supervisor:
             state = change(state)
         return state
 
-    def _miss(self, window: Window, reason: str) -> None:
+    def _miss(self, window: Task, reason: str) -> None:
         self.missed += 1
         repeated = reason == NOT_READY == self._last_reason  # warn once about all windows missed during compilation
         self._last_reason = reason

@@ -22,6 +22,7 @@ from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Rows
+from tests.acquisition.series import cut_next
 from tests.drivers.logs import BEGUN, UNITS, frames_of, live, opened, samples_of, written
 from tests.messages import assert_refuses, raises_saying
 from tests.waiting import PATIENCE
@@ -77,7 +78,7 @@ def cut_live(frames: list[can.Message]) -> list[Window]:
         del samples[:arrived]
         if windower.begin(rings, now, now - BEGUN):
             while windower.due(rings, now):
-                windows.append(windower.cut(rings, offset=0.0))
+                windows.append(cut_next(windower, rings))
         now += 0.004
     return windows
 
