@@ -6,7 +6,7 @@ Nothing here changes what a daemon has learned or writes a file: each method ret
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import amplitude_indices, equation, indices
 from otolith.estimation.window_fit import fit_predicted
+from otolith.exchange.export_modelica import modelica_text
+from otolith.exchange.export_python import python_text
+from otolith.exchange.exported import ExportedTwin, exported_twin
 from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import forecast, with_baselines
 from otolith.health.times import moment_text
@@ -24,9 +27,6 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import Replay, open_recordings
 from otolith.runtime.simulation_inputs import PlannedRows, RecordedStretch, read_inputs, read_recorded
 from otolith.simulation import what_if
-from otolith.simulation.export_modelica import modelica_text
-from otolith.simulation.export_python import python_text
-from otolith.simulation.exported import ExportedTwin, exported_twin
 from otolith.simulation.initial_state import after_window
 from otolith.simulation.plan import joined, planned_window
 from otolith.simulation.prediction import Prediction
@@ -392,6 +392,20 @@ class Twin:
         """Return the twin as a Modelica model; raises as :meth:`python`."""
         twin, notes = self._exported()
         return modelica_text(twin, notes, f"{self.machine.file.machine.name}_adapted")
+
+    def fmu(self, version: Literal["2", "3"] = "2") -> bytes:
+        """Return the twin as an FMU of FMI 2.0 or 3.0 for co-simulation and model exchange: the content of the file.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: no window was learned from yet, or there is no C compiler.
+        """
+        from otolith.exchange.fmu import Stepping, fmu_files  # noqa: PLC0415 - loads SymPy
+        from otolith.exchange.model_description import Version  # noqa: PLC0415 - the same
+        from otolith.runtime.fmu_archive import fmu_archive  # noqa: PLC0415 - the same
+
+        twin, notes = self._exported()
+        kernel, name = Stepping(self._period, substeps_of(self.posterior)), self.machine.file.machine.name
+        return fmu_archive(fmu_files(twin, notes, Version(version), kernel, name))
 
     def _exported(self) -> tuple[ExportedTwin, tuple[str, ...]]:
         """Return what is exported, and of which machine and time it is."""

@@ -303,6 +303,12 @@ def to_base(text: str) -> tuple[float, float]:
     return one - zero, zero
 
 
+def base_exponents(text: str) -> dict[str, float]:
+    """Return the exponents of the SI base units, and of the radian, of the unit ``text``, by their symbols."""
+    base = _registry().Quantity(1.0, unit(text)).to_base_units()
+    return {f"{_registry().Unit(name):~}": float(str(exponent)) for name, exponent in base.unit_items()}
+
+
 def is_one_in_si(one: str, other: str) -> bool:
     """Return whether units of two quantities are the same in SI, as V*s/rad and N*m/A are.
 

@@ -16,8 +16,8 @@ PAGE = (Path(__file__).parents[2] / "docs" / "simulate.md").read_text(encoding="
 def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     save_learned(write_files(tmp_path))
     monkeypatch.chdir(tmp_path)
-    commands = re.findall(r"^    otolith ((?:simulate|twin export) .*)$", PAGE, re.MULTILINE)
-    assert len(commands) == 7
+    commands = re.findall(r"^    otolith (simulate .*)$", PAGE, re.MULTILINE)
+    assert len(commands) == 5
     for command in commands:
         assert otolith(*shlex.split(command)).exit_code == 0
     names: dict[str, object] = {}

@@ -21,6 +21,7 @@ SOURCES = {
     "discovery": [DAEMON / "discovery"],
     "drivers": [DRIVERS, DRIVERS / "common", DRIVERS / "grammars"],
     "estimation": [DAEMON / "estimation"],
+    "exchange": [DAEMON / "exchange"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],
     "mqtt": [DRIVERS],

@@ -1,7 +1,7 @@
 """``otolith twin``: the library of twins, one as a page of equations or for other tools, the check of a user's own."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -134,30 +134,47 @@ def _print(definition: "Definition") -> None:
 @MACHINE_FILE
 @click.option("--python", "language", flag_value="python", help="As a Python program that needs NumPy alone.")
 @click.option("--modelica", "language", flag_value="modelica", help="As a Modelica model.")
+@click.option("--fmu", type=FILE, callback=new_file, metavar="FILE",
+              help="As this new FMU, for co-simulation and model exchange.")  # fmt: skip
+@click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="Version of the FMU.")
 @click.option("--after", "recordings", type=FILE, multiple=True, metavar="DATA",
               help="Adapt the twin to this recording, not to what a daemon has learned; may be repeated.")  # fmt: skip
 @click.option("--output", type=FILE, callback=new_file, metavar="FILE", help="Write this new file instead of printing.")
-def export(file: Path, language: str | None, recordings: tuple[Path, ...], output: Path | None) -> None:
+def export(
+    file: Path,
+    language: str | None,
+    fmu: Path | None,
+    fmi: Literal["2", "3"],
+    recordings: tuple[Path, ...],
+    output: Path | None,
+) -> None:
     """Print the adapted twin of a machine with its discovered components.
 
     The text has the equations, the values with their intervals, and where each is
-    from. It can be read, changed and run without Otolith.
+    from. It can be read, changed and run without Otolith. An FMU has them as C
+    and compiled: other simulators import it. Its compilation needs gcc.
 
     \b
     Examples:
       otolith twin export press-3 --python > press_3.py
       otolith twin export press-3 --modelica --output press_3.mo
+      otolith twin export press-3 --fmu press_3.fmu
       otolith twin export my-machine.toml --after monday.csv --python
     """
     from otolith.cli.common import progress_line
     from otolith.cli.operation.history import write_page
     from otolith.notebook import Twin
 
-    if language is None:
-        raise click.UsageError("give --python or --modelica")
+    if (language is None) == (fmu is None):
+        raise click.UsageError("give one of --python, --modelica and --fmu")
+    if fmu is not None and output is not None:
+        raise click.UsageError("--fmu names the new file: leave --output out")
     use_state_of_service(file)
     with progress_line("exporting"):
         adapted = Twin.fresh(file).adapted(*recordings) if recordings else Twin.load(file)
+        if fmu is not None:
+            write_page(fmu, adapted.fmu(fmi))
+            return
         text = adapted.python() if language == "python" else adapted.modelica()
     if output is None:
         echo(*text.rstrip("\n").split("\n"))

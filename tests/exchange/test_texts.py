@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,72 +10,38 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array
-from otolith.estimation.objective import input_matrix, time_offsets
-from otolith.estimation.posterior import PhaseAdvance, Posterior
-from otolith.estimation.problem import Component, augment
+from otolith.estimation.problem import Component
+from otolith.exchange.export_modelica import identifier, modelica_expression, modelica_text
+from otolith.exchange.export_python import python_text
+from otolith.exchange.exported import exported_twin
 from otolith.machine import library_twins
-from otolith.simulation.export_modelica import identifier, modelica_expression, modelica_text
-from otolith.simulation.export_python import python_text
-from otolith.simulation.exported import exported_twin
-from otolith.simulation.plan import planned_window
-from otolith.simulation.simulate import STEP_RECORDS, substeps_of
-from otolith.twin.expressions import parse
-from otolith.twin.kernel import Excitation, kernel_of
-from tests.simulation.motors import PERIOD, library_state, posterior, problem
+from otolith.twin.expressions import names_in, parse
+from tests.exchange.driven import COMPONENTS, Driven, awkward_state, completed
+from tests.simulation.motors import library_state, posterior
 from tests.variants import often
 
-COMPONENTS = (
-    (Component("shaft", "periodic", "angle(omega)", 0.005, 1.0, 0.3, 0.5, 2.0),
-     Component("winding", "linear", "omega", 0.02),
-     Component("sensor of omega", "constant", "", 0.5)),
-    (Component("shaft", "Coulomb", "omega", 0.004, 0.5, low=0.1, high=2.0),
-     Component("sensor of T_load", "periodic", "t", 0.01, 6.0, 0.2, 1.0, 9.0),
-     Component("gain of omega", "periodic", "angle(omega)", 0.02, 2.0, 0.1, 0.5, 4.0)),
-    (Component("shaft", "exponential", "t", 1e-3, 0.2, low=0.01, high=1.0, origin=-3.0),
-     Component("winding", "power", "i", 0.1, 1.5, low=0.3, high=4.0),
-     Component("sensor of i", "negative exponential", "V_a", 0.1, 0.1, low=0.01, high=1.0)),
-)  # fmt: skip
 
-
-def completed(components: tuple[Component, ...]) -> Posterior:
-    """The motor with components."""
-    twin = augment(problem(), components)
-    return replace(posterior().remap_parameters(twin), phase=PhaseAdvance(-1.99, PERIOD, (0.0,) * 3, (1.0, 10.0)))
-
-
-def trajectories(state: Posterior) -> tuple[Array, Array]:
-    """Those of the exported program, and those of the kernel, along steps of the inputs."""
-    own = state.problem
-    twin, times = own.base_model, PERIOD * np.arange(60, dtype=np.float64)
-    columns = {item.name: np.where(np.arange(60) < STEP_RECORDS, item.low, item.high) for item in twin.inputs}
-    window = planned_window(twin, times, columns, PERIOD, 0.0)
-    count = substeps_of(state)
+def program_trajectories(driven: Driven) -> Array:
+    """Those of the exported program."""
     program: dict[str, Any] = {"__name__": "exported"}
-    exec(python_text(exported_twin(state), ("a test",), count), program)  # noqa: S102 - our own text
-    found = program["simulate"](times, np.column_stack(list(columns.values())))
-    known = dict(own.known) | time_offsets(own, 0.0)
-    known |= dict(zip((item.name for item in own.free), state.at_last_record().prior().mean, strict=False))
-    values = np.array([[known.get(item.name, item.nominal) for item in own.twin.parameters]])
-    assert state.phase is not None
-    reached = np.zeros((1, len(own.twin.states)))
-    reached[0, : len(twin.states)] = state.phase.last_state
-    excitation = Excitation(input_matrix(own.twin, window), window.grid, substeps=count)
-    return found, kernel_of(own.twin).simulate(values, reached, excitation)[0]
+    exec(python_text(exported_twin(driven.state), ("a test",), driven.substeps), program)  # noqa: S102 - our own text
+    found: Array = program["simulate"](driven.times, np.column_stack(list(driven.columns.values())))
+    return found
 
 
 @pytest.mark.parametrize("name", often(["dc_motor"], library_twins()))
 def test_the_exported_program_is_the_kernel(name: str) -> None:
-    found, exact = trajectories(library_state(name))
-    assert np.isfinite(exact).all()
-    np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-9)
+    driven = Driven(library_state(name))
+    assert np.isfinite(driven.exact).all()
+    np.testing.assert_allclose(program_trajectories(driven), driven.exact, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("components", COMPONENTS, ids=lambda row: ", ".join(item.key for item in row))
 def test_components_are_exported_at_their_sites(components: tuple[Component, ...]) -> None:
-    found, exact = trajectories(completed(components))
-    bare, _ = trajectories(posterior())
-    np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-9)
-    assert np.abs(found - bare).max() > 1e-3
+    driven = Driven(completed(components))
+    found = program_trajectories(driven)
+    np.testing.assert_allclose(found, driven.exact, rtol=1e-6, atol=1e-9)
+    assert np.abs(found - program_trajectories(Driven(posterior()))).max() > 1e-3
 
 
 def test_the_program_runs_by_itself_and_says_what_is_known(tmp_path: Path) -> None:
@@ -124,8 +89,20 @@ def test_the_model_has_an_equation_for_each_unknown() -> None:
     ],
 )
 def test_expressions_of_modelica_mean_the_same(written: str, expected: str) -> None:
-    assert modelica_expression(parse(written)) == expected
+    tree = parse(written)
+    names = {name: identifier(name) for name in names_in(tree)}
+    assert modelica_expression(tree, names) == expected
 
 
 def test_names_are_those_of_modelica() -> None:
     assert [identifier(name) for name in ("omega", "in", "press-3", "3d")] == ["omega", "in_", "press_3", "m_3d"]
+
+
+def test_no_two_quantities_share_a_name() -> None:
+    """The author may have a name that another one gets because it is a word of Modelica."""
+    text = modelica_text(exported_twin(awkward_state()), ("a note",), "end_")
+    declared = re.findall(r"^  (?:parameter |input |output )?Real (\w+)", text, re.MULTILINE)
+    assert len(declared) == len(set(declared)) == 13
+    assert not {"end", "Real", "end_"} & set(declared)  # words of the language, and the model itself
+    driven = Driven(awkward_state())
+    np.testing.assert_allclose(program_trajectories(driven), driven.exact, rtol=1e-6, atol=1e-9)

@@ -7,12 +7,14 @@ drives the twin.
 
 import ast
 import copy
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from otolith.estimation.objective import time_offsets
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, equation, indices, site_of, source_of
+from otolith.exchange.identifiers import free_name
 from otolith.simulation.initial_state import last_state
 from otolith.simulation.what_if import supposed_values
 from otolith.twin.components import shift_setting
@@ -33,6 +35,7 @@ class ExportedValue:
     sd: float  # Standard deviation; 0 of a value that is given
     unit: str
     meaning: str
+    is_constant: bool = False  # Of nature or of the design: no machine file changes it
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,7 @@ class ExportedState:
     unit: str
     meaning: str
     initial: float  # At the last record that was learned from
+    size: float  # Largest ordinary magnitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +84,11 @@ class _Export:
         self._base = self._problem.base_model
         self._scales = {name: to_base(unit)[0] for name, unit in self._base.units().items()}
         taken = {*self._base.units(), *(name for name, _, _ in self._base.definitions), TIME}
-        count = len(self._problem.components)
-        self._names = [_free_name(f"component_{slot + 1}", taken) for slot in range(count)]
+        self._names = [
+            free_name(re.sub(r"\W+", "_", f"{item.site}_{item.family}"), taken) for item in self._problem.components
+        ]
         self._angles = {
-            item.source: _free_name(f"angle_{item.source[6:-1]}", taken)
+            item.source: free_name(f"angle_{item.source[6:-1]}", taken)
             for item in self._problem.components
             if item.source.startswith("angle(")
         }
@@ -134,23 +139,25 @@ class _Export:
             is_given = item.name in known or index is None
             value, sd = (known[item.name], 0.0) if is_given else (float(prior.mean[index]), float(prior.sd[index]))
             found.append(ExportedValue(item.name, value, sd, item.unit, item.meaning))
-        found += [ExportedValue(item.name, item.value, 0.0, item.unit, item.meaning) for item in self._base.constants]
+        found += [
+            ExportedValue(item.name, item.value, 0.0, item.unit, item.meaning, is_constant=True)
+            for item in self._base.constants
+        ]
         for slot in range(len(problem.components)):
             for suffix, index in zip(("amplitude", "inner", "phase"), indices(problem, slot), strict=False):
-                item = problem.free[index]
-                name, values = f"{self._names[slot]}_{suffix}", (float(prior.mean[index]), float(prior.sd[index]))
-                found.append(ExportedValue(name, *values, item.unit, item.meaning))
+                item, values = problem.free[index], (float(prior.mean[index]), float(prior.sd[index]))
+                found.append(ExportedValue(f"{self._names[slot]}_{suffix}", *values, item.unit, item.meaning))
         return tuple(found)
 
     def _states(self) -> tuple[ExportedState, ...]:
         reached = last_state(self._posterior)
         found = [
-            ExportedState(item.name, item.unit, item.meaning, float(value))
+            ExportedState(item.name, item.unit, item.meaning, float(value), max(abs(item.low), abs(item.high)))
             for item, value in zip(self._base.states, reached, strict=False)
         ]
         for source, name in self._angles.items():
             unit = source_of(self._base, source).unit
-            found.append(ExportedState(name, unit, f"integral of {source[6:-1]} since the first record", 0.0))
+            found.append(ExportedState(name, unit, f"integral of {source[6:-1]} since the first record", 0.0, 1.0))
         return tuple(found)
 
     def _order(self) -> list[tuple[str, ast.expr]]:
@@ -219,14 +226,6 @@ def _sums(terms: Iterable[tuple[str, ast.expr]]) -> dict[str, ast.expr]:
     for left, term in terms:
         found[left] = _plus(found[left], term) if left in found else term
     return found
-
-
-def _free_name(wanted: str, taken: set[str]) -> str:
-    """Return the name, with underscores as needed to be none of those ``taken``, and take it."""
-    while any(name == wanted or name.startswith(f"{wanted}_") for name in taken):
-        wanted += "_"
-    taken.add(wanted)
-    return wanted
 
 
 def _names_in(tree: ast.expr) -> set[str]:

@@ -3,13 +3,15 @@
 import ast
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from otolith.simulation.export_python import comment
-from otolith.simulation.exported import TIME, ExportedTwin
+from otolith.exchange.export_python import comment
+from otolith.exchange.exported import TIME, ExportedTwin
+from otolith.exchange.identifiers import identifiers
 from otolith_drivers.outside_text import visible
 
-KEYWORDS = frozenset({
+RESERVED = frozenset({
+    "Boolean", "Integer", "Real", "String",  # a variable of such a name would hide the type
     "algorithm", "and", "annotation", "assert", "block", "break", "class", "connect", "connector", "constant",
     "constrainedby", "der", "discrete", "each", "else", "elseif", "elsewhen", "encapsulated", "end", "enumeration",
     "equation", "expandable", "extends", "external", "false", "final", "flow", "for", "function", "if", "import",
@@ -31,36 +33,41 @@ def modelica_text(twin: ExportedTwin, notes: Sequence[str], name: str) -> str:
 def identifier(name: str) -> str:
     """Return a name that Modelica accepts."""
     text = re.sub(r"\W", "_", name, flags=re.ASCII)
-    return f"{text}_" if text in KEYWORDS else text if re.match(r"[A-Za-z_]", text) else f"m_{text}"
+    return f"{text}_" if text in RESERVED else text if re.match(r"[A-Za-z_]", text) else f"m_{text}"
 
 
 def _lines(twin: ExportedTwin, notes: Sequence[str], name: str) -> Iterator[str]:
+    shown = [f"{READING}{own}" for own, _, _ in twin.outputs]
+    quantities = [item.name for group in (twin.values, twin.inputs, twin.states) for item in group]
+    named = [own for group in (twin.components, twin.definitions) for own, _, _ in group]
+    known = identifiers([*quantities, *named], identifier, {name})
+    readings = identifiers(shown, identifier, {name, *known.values()})
     yield f'model {name} "{_plain(twin.title)}, as Otolith has adapted it"'
     yield from (f"  // {_plain(line)}" for line in notes)
     yield f"  // Source of the equations: {_plain(twin.source)}"
     yield "  // Intervals are of 95 %. Units are those of the comments; equations hold in SI units."
     for item in twin.values:
-        declared = f'  parameter Real {identifier(item.name)} = {item.value!r} "{_plain(item.meaning)}";'
+        declared = f'  parameter Real {known[item.name]} = {item.value!r} "{_plain(item.meaning)}";'
         yield f"{declared} // {_plain(comment(item))}"
     for driven in twin.inputs:
         held = "held between samples" if driven.hold == "zoh" else "linear between samples"
-        yield f'  input Real {identifier(driven.name)} "{_plain(driven.meaning)}"; // {driven.unit}, {held}'
+        yield f'  input Real {known[driven.name]} "{_plain(driven.meaning)}"; // {driven.unit}, {held}'
     for state in twin.states:
         start = f"(start = {state.initial!r}, fixed = true)"
-        yield f'  Real {identifier(state.name)}{start} "{_plain(state.meaning)}"; // {state.unit}'
-    for own, unit, meaning in twin.outputs:
-        yield f'  output Real {READING}{own} "{_plain(meaning)}"; // {unit}'
+        yield f'  Real {known[state.name]}{start} "{_plain(state.meaning)}"; // {state.unit}'
+    for (_, unit, meaning), reading in zip(twin.outputs, shown, strict=True):
+        yield f'  output Real {readings[reading]} "{_plain(meaning)}"; // {unit}'
     for own, _, words in twin.components:
-        yield f'  Real {identifier(own)} "discovered component, {_plain(words)}";'
+        yield f'  Real {known[own]} "discovered component, {_plain(words)}";'
     for own, _, meaning in twin.definitions:
-        yield f'  Real {identifier(own)} "{_plain(meaning)}";'
+        yield f'  Real {known[own]} "{_plain(meaning)}";'
     yield "equation"
-    yield from (f"  {identifier(own)} = {modelica_expression(tree)};" for own, tree, _ in twin.components)
-    yield from (f"  {identifier(own)} = {modelica_expression(tree)};" for own, tree, _ in twin.definitions)
+    for own, tree, _ in (*twin.components, *twin.definitions):
+        yield f"  {known[own]} = {modelica_expression(tree, known)};"
     for state, tree in zip(twin.states, twin.rates, strict=True):
-        yield f"  der({identifier(state.name)}) = {modelica_expression(tree)};"
-    for (own, _, _), tree in zip(twin.outputs, twin.shown, strict=True):
-        yield f"  {READING}{own} = {modelica_expression(tree)};"
+        yield f"  der({known[state.name]}) = {modelica_expression(tree, known)};"
+    for reading, tree in zip(shown, twin.shown, strict=True):
+        yield f"  {readings[reading]} = {modelica_expression(tree, known)};"
     yield f"end {name};"
 
 
@@ -69,28 +76,32 @@ def _plain(text: str) -> str:
     return visible(text).replace("\\", "/").replace('"', "'")
 
 
-def modelica_expression(tree: ast.expr, strength: int = 0) -> str:
-    """Return an expression of the twin language; in parentheses if its operator is weaker than ``strength``."""
+def modelica_expression(tree: ast.expr, names: Mapping[str, str], strength: int = 0) -> str:
+    """Return an expression of the twin language, with ``names`` by those of the author.
+
+    It is in parentheses if its operator is weaker than ``strength``.
+    """
     match tree:
         case ast.Constant(value=value):
             return repr(value)
         case ast.Name(id=name):
-            return {"pi": repr(math.pi), TIME: "time"}.get(name) or identifier(name)
+            return {"pi": repr(math.pi), TIME: "time"}.get(name) or names[name]
         case ast.UnaryOp(op=operator, operand=operand):
             sign = "-" if isinstance(operator, ast.USub) else "+"
-            text = f"{sign}{modelica_expression(operand, 3)}"
+            text = f"{sign}{modelica_expression(operand, names, 3)}"
             return f"({text})" if strength else text
         case ast.BinOp(left=left, op=operator, right=right):
             own = STRENGTH[type(operator)]
             is_power = isinstance(operator, ast.Pow)
-            ends = modelica_expression(left, own + is_power), modelica_expression(right, own + 1)
+            ends = modelica_expression(left, names, own + is_power), modelica_expression(right, names, own + 1)
             text = f" {OPERATORS[type(operator)]} ".join(ends)
             return f"({text})" if own < strength else text
         case ast.Call(func=ast.Name(id="where"), args=[ast.Compare() as test, then, otherwise]):
-            sides = modelica_expression(test.left, 1), modelica_expression(test.comparators[0], 1)
+            sides = (modelica_expression(side, names, 1) for side in (test.left, test.comparators[0]))
             condition = f" {COMPARED[type(test.ops[0])]} ".join(sides)
-            return f"(if {condition} then {modelica_expression(then)} else {modelica_expression(otherwise)})"
+            first, second = (modelica_expression(side, names) for side in (then, otherwise))
+            return f"(if {condition} then {first} else {second})"
         case ast.Call(func=ast.Name(id=name), args=arguments):
-            return f"{name}({', '.join(map(modelica_expression, arguments))})"
+            return f"{name}({', '.join(modelica_expression(argument, names) for argument in arguments)})"
         case _:
             raise AssertionError(ast.dump(tree))

@@ -4,7 +4,7 @@ import ast
 from collections.abc import Iterator, Sequence
 
 from otolith.estimation.information import QUANTILE
-from otolith.simulation.exported import TIME, ExportedTwin, ExportedValue
+from otolith.exchange.exported import TIME, ExportedTwin, ExportedValue
 from otolith.twin.expressions import FUNCTIONS
 from otolith_drivers.outside_text import visible
 
