@@ -433,10 +433,17 @@ def _moment_text(seconds: float, zone: str | None) -> str:
 def _values_at(reader: HistoryReader, time: float) -> dict[str, HistorySample]:
     """Return the value of each parameter, and of each amplitude by the key of its component, that held at ``time``.
 
-    Of each the finest resolution that is kept counts; raises as the reader.
+    Of each the finest resolution that is kept counts, and of that the value whose time is nearest: an interval has the
+    value at its end, which is up to a day after its begin. Raises as the reader.
     """
     found: dict[str, HistorySample] = {}
     for resolution in RESOLUTIONS:
-        samples = reader.samples(resolution, time - (resolution or MINUTE))  # the time of a window is its end
-        found = {sample.name: sample for sample in samples if sample.time <= time} | found
+        reach = resolution or MINUTE
+        own: dict[str, tuple[float, HistorySample]] = {}
+        for sample in reader.samples(resolution, time - 2.0 * reach):
+            age = time - (sample.time + resolution)  # the time of a window is its end
+            is_then = 0.0 <= age <= reach or (resolution and -reach < age < 0.0)
+            if is_then and abs(age) <= own.get(sample.name, (reach, sample))[0]:
+                own[sample.name] = abs(age), sample
+        found = {name: sample for name, (_, sample) in own.items()} | found
     return found

@@ -1,14 +1,16 @@
 """``otolith export``: the raw samples of recordings, bit for bit, in a file that other programs read."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from otolith.cli.operation.export import ROWS_AT_ONCE
+from otolith.cli.operation.export import ROWS_AT_ONCE, _schema
 from otolith.machine import LoadedMachine, load_machine
+from otolith.machine_file import ParameterTable
 from otolith.runtime import replay
 from otolith.runtime.replay import open_recorded, open_recordings
 from otolith_drivers.errors import ConfigurationError
@@ -68,6 +70,18 @@ def test_files_follow_one_another_and_are_compressed_as_numbers(tmp_path: Path, 
     column = file.row_group(0).column(3)
     assert (column.compression, "BYTE_STREAM_SPLIT" in column.encodings) == ("ZSTD", True)
     assert 3 * len(rows) < ROWS_AT_ONCE
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "own"), [("t", "recording", "t_"), ("recording", "recording_", "recording")]
+)
+def test_a_signal_may_be_called_as_a_column_of_ours(name: str, number: str, own: str) -> None:
+    machine = load_machine(MACHINE, with_driver=False)
+    heated = ParameterTable(temperature=name)
+    machine = replace(machine, file=machine.file.model_copy(update={"parameters": {"R_a": heated}}))
+    schema = _schema(machine)
+    assert schema.names == ["t", number, "V_a", "T_load", "i", "omega", own]
+    assert schema.field(own).metadata[b"unit"] == b"K"
 
 
 def test_what_fails_leaves_no_file(tmp_path: Path, rows: Lines) -> None:

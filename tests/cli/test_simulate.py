@@ -14,10 +14,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from otolith import Twin
+from otolith import Twin, notebook
 from otolith.adaptation.state import AdaptationState, OperatorDecisions
 from otolith.machine import load_machine
-from otolith.storage.history import history_directory
+from otolith.runtime import simulation_inputs
+from otolith.storage.history import HOUR, history_directory
 from otolith.storage.log_history import log_history
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
@@ -161,6 +162,32 @@ def test_the_values_of_an_earlier_time_come_from_the_history(machine: Path) -> N
     assert then.simulate(machine.with_name("plan.csv")).records == 251
     with raises_saying(ConfigurationError, "R_a", "history"):
         Twin.load(machine).at(begin - 100_000.0)
+
+
+def test_a_plan_that_is_too_long_is_not_read_to_its_end(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is wrong behind the bound is not seen."""
+    plan = machine.with_name("long.csv")
+    rows = [f"{0.01 * index:.2f},12,20" for index in range(40_000)]
+    plan.write_text("\n".join(["t,V_a [V],T_load [mN*m]", *rows, "no,number,here"]) + "\n", encoding="utf-8")
+    monkeypatch.setattr(simulation_inputs, "MAX_RECORDS", 10_000)
+    with raises_saying(ConfigurationError, str(plan), "10000", "shorten"):
+        Twin.load(machine).simulate(plan)
+
+
+@pytest.mark.parametrize(("after", "value"), [(300.0, 6.3), (3300.0, 6.2)])
+def test_of_an_hour_the_value_that_is_nearest_counts(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, after: float, value: float
+) -> None:
+    """The history has that of the end of each hour, where it has no minutes any more."""
+    names, begin = load_machine(machine, with_driver=False).file.machine, 472_222 * 3600.0
+    with log_history(history_directory(), names.site, names.name) as history:
+        for hour in range(4):
+            report = document(hour, begin + 3600.0 * hour + 3590.0, 6.4 - 0.1 * hour)
+            history.add(report.model_copy(update={"machine": names.name, "site": names.site}))
+        history.describe("{}")
+    monkeypatch.setattr(notebook, "RESOLUTIONS", {HOUR: "hour"})
+    then = Twin.load(machine).at(begin + 7200.0 + after)
+    assert then.parameters[0].value == pytest.approx(value)
 
 
 def test_residuals_of_a_recording_that_is_explained_are_noise(machine: Path) -> None:

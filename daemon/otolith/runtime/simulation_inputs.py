@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 
@@ -101,10 +102,13 @@ def read_plan(machine: LoadedMachine, data: Path) -> PlannedRows:
             f"{data}: the twin {machine.twin.name!r} has no measured input: nothing can be planned"
         )
     with open_by_name(machine, data, inputs) as reader:
-        parts = list(reader.chunks())
-        rows = parts[0]
-        for part in parts[1:]:
-            rows = rows.followed_by(part)
+        parts, count = list[Rows](), 0
+        for part in reader.chunks():
+            parts.append(part)
+            count += len(part.times)
+            if count > MAX_RECORDS:
+                raise ConfigurationError(f"{data}: more than {MAX_RECORDS} rows: shorten the plan")
+        rows = reduce(Rows.followed_by, parts)
         faults, ignored = reader.warnings(), reader.ignored
         if reader.bad:
             cause = COUNTS.sub(r"line \1: ", faults[0]) if faults else "a cell that is no number"

@@ -74,11 +74,13 @@ def _write_rows(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from otolith.machine_file import signal_units
+
     schema, rows, recordings = _schema(machine), 0, 0
-    signals = schema.names[2:]
-    split = dict.fromkeys((TIME, *signals), "BYTE_STREAM_SPLIT")
+    number, headers, signals = schema.names[1], schema.names[2:], signal_units(machine.file, machine.twin)
+    split = dict.fromkeys((TIME, *headers), "BYTE_STREAM_SPLIT")
     with pq.ParquetWriter(
-        target, schema, compression="zstd", use_dictionary=[RECORDING], column_encoding=split
+        target, schema, compression="zstd", use_dictionary=[number], column_encoding=split
     ) as writer:  # fmt: skip
         for part in _joined(data.chunks()):
             if stopped():
@@ -96,12 +98,16 @@ def _write_rows(
 def _schema(machine: "LoadedMachine") -> "pa.Schema":
     import pyarrow as pa
 
+    from otolith.exchange.identifiers import identifiers
     from otolith.machine_file import signal_units
 
     names = machine.file.machine
     units = signal_units(machine.file, machine.twin)
-    numbers = [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in {TIME: "s", **units}.items()]
-    fields = [numbers[0], pa.field(RECORDING, pa.int32(), nullable=False), *numbers[1:]]
+    headers = identifiers(units, str, {TIME})  # a temperature may have any name
+    (number,) = identifiers([RECORDING], str, {TIME, *headers.values()}).values()
+    numbers = [pa.field(headers[name], pa.float64(), metadata={"unit": unit}) for name, unit in units.items()]
+    time = pa.field(TIME, pa.float64(), metadata={"unit": "s"})
+    fields = [time, pa.field(number, pa.int32(), nullable=False), *numbers]
     return pa.schema(fields, {"machine": names.name, "site": names.site, "twin": machine.twin.name})
 
 
