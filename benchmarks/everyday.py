@@ -141,7 +141,11 @@ def simulate(machine: Machine, seconds: float, seed: int) -> tuple[tuple[str, ..
 
 def run(name: str, seed: int) -> Outcome:
     """Return what is announced in one run of a situation."""
-    situation = next(item for item in SITUATIONS if item.name == name)
+    return run_of(next(item for item in SITUATIONS if item.name == name), seed)
+
+
+def run_of(situation: Situation, seed: int) -> Outcome:
+    """Return what is announced in one run of a situation."""
     machine = machine_of("motor")
     state = initial_state("m", "s", machine.problem, machine.plan)
     signals, values = simulate(situation.machine, situation.seconds, seed)
@@ -167,7 +171,8 @@ def run(name: str, seed: int) -> Outcome:
             if event.change is EventChange.RAISED and not event.is_hint:
                 false += not situation.right or window.end <= situation.onset
         named |= {rule for event in report.document.open_events for rule in event.condition_id.split()}
-    return Outcome(name, verdict(situation, named), situation.seconds, false, covered, intervals, longest, tuple(story))
+    judged = verdict(situation, named)
+    return Outcome(situation.name, judged, situation.seconds, false, covered, intervals, longest, tuple(story))
 
 
 def verdict(situation: Situation, named: set[str]) -> str:

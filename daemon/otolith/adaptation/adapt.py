@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.adaptation.operating_states import running_part
 from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
@@ -72,7 +73,15 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     used, shortened = last_records(window)
     state, predicted, checked = _predict_and_check(state, used)
     tested, checked = _fit(state, predicted, checked)
-    if tested is None:
+    part = None if tested is None or tested.is_expected else running_part(predicted.problem, used)
+    if part is not None:
+        shortened = (*shortened, part.note)
+        used = part.window or used
+        state, predicted, checked = _predict_and_check(state, used)
+        tested, checked = (None, checked) if part.window is None else _fit(state, predicted, checked)
+    if part is not None and part.window is None:
+        result, ledger = _switched_off(state, predicted, part.note), state.ledger
+    elif tested is None:
         result, ledger = _reject(state, predicted, checked), state.ledger
     else:
         scores = _score(state, tested)
@@ -167,6 +176,11 @@ def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow
     decision = WindowDecision.BAD if checked.bad else WindowDecision.SENSOR
     reason = UNUSED + "; ".join(checked.bad or (sensor.text for sensor in checked.faulty_sensors))
     return WindowResult.unchanged(state, predicted, decision, reason=reason)
+
+
+def _switched_off(state: AdaptationState, predicted: Posterior, note: str) -> WindowResult:
+    """Return the result of a window in which the drive is off: it does not update the posterior."""
+    return WindowResult.unchanged(state, predicted, WindowDecision.OFF, reason=UNUSED + note)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

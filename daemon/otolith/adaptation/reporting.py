@@ -15,6 +15,7 @@ from otolith.discovery.alternatives import (
     COMPONENT_PROBABILITY,
     COMPONENT_WINDOWS,
     DATA_FAULTS,
+    NO_EVIDENCE,
     POLLED,
     UPDATES,
     PosteriorUpdate,
@@ -135,7 +136,7 @@ class WindowResult:
 
     def contradictions(self, state: AdaptationState) -> int:
         """Return how many windows in a row, with this one, did not update the posterior; bad data are not counted."""
-        return 0 if self.is_accepted else state.contradictions + (self.decision is not WindowDecision.BAD)
+        return 0 if self.is_accepted else state.contradictions + (self.decision not in NO_EVIDENCE)
 
     def noisier_since(self, state: AdaptationState) -> float | None:
         """Return from when on more noise than stated is accepted, service time in s; None if none is."""

@@ -38,6 +38,7 @@ class WindowDecision(StrEnum):
     SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
     TIMING = "a signal is late: its delay does not count as a change of a parameter"
     BAD = "the window is not good enough: it does not update the estimates"
+    OFF = "the drive is switched off, so that the equations of the twin do not hold: it does not update the estimates"
     REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
 
     @property
@@ -246,5 +247,6 @@ ALTERNATIVES: Mapping[FaultType, AlternativeRow] = {
     ),
 }
 """In the order in which they are decided."""
+NO_EVIDENCE = frozenset({WindowDecision.BAD, WindowDecision.OFF})  # Of windows that are evidence of nothing
 DATA_FAULTS = frozenset(row.decision for row in ALTERNATIVES.values() if row.is_of_data)
 """Decisions that data are wrong."""

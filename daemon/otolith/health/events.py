@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from typing import Any
 
-from otolith.discovery.alternatives import ACCEPTED, WindowDecision
+from otolith.discovery.alternatives import ACCEPTED, NO_EVIDENCE, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan, diagnose
 from otolith.health.limits import MACHINE, Coldness, Level, MonitoredQuantity
@@ -276,7 +276,7 @@ def _with_doubts(state: HealthState, report: ReportDocument) -> HealthState:
     doubtful = tuple(index for index in state.doubtful if now - RELEASE_WINDOWS < index < now)
     if report.decision in ACCEPTED:
         return replace(state, doubtful=doubtful, agreed=now)
-    if report.decision is not WindowDecision.BAD:
+    if report.decision not in NO_EVIDENCE:
         agreed = state.agreed if state.agreed < now else -1  # of an earlier run
         first = doubtful[-1] + 1 if doubtful and agreed < doubtful[-1] else now
         doubtful += tuple(range(first, now + 1))

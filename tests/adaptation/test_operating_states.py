@@ -1,0 +1,92 @@
+"""A drive that is switched off is evidence of nothing, and hides no fault of a drive that is on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from benchmarks.diagnosis import machine_of
+from benchmarks.everyday import (
+    NOISE,
+    PERIOD,
+    RECORDS,
+    RESISTANCE,
+    SITUATIONS,
+    Machine,
+    Situation,
+    run_of,
+    simulate,
+)
+
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.operating_states import MIN_OFF, off_records, running_part
+from tests.variants import often
+
+MOTOR = machine_of("motor").problem
+STOPS = Machine(enabled=lambda time: time % 40.0 < 28.0)
+
+
+def window_of(values: Array) -> Window:
+    return Window.whole(0, 0.0, PERIOD, tuple(NOISE), values)
+
+
+@pytest.mark.parametrize("seed", often([1, 2], [1, 2, 3, 4, 5, 6]))
+@pytest.mark.parametrize("length", [10.0, 15.0])
+def test_a_drive_that_is_switched_off_is_no_event(seed: int, length: float) -> None:
+    """The motor coasts against its load, and a worm gear holds it: the twin would let it turn back."""
+    machine = Machine(enabled=lambda time: time % 40.0 < 40.0 - length)
+    outcome = run_of(Situation("stops", machine), seed)
+    assert (outcome.verdict, outcome.false_events) == ("right", 0), outcome.story
+    assert outcome.covered >= 0.9 * outcome.intervals
+
+
+@pytest.mark.parametrize("seed", often([1], [1, 2, 3]))
+def test_turns_that_short_out_are_found_between_the_stops(seed: int) -> None:
+    situation = next(item for item in SITUATIONS if item.name == "turns short out")
+    fault = replace(situation.machine, enabled=STOPS.enabled)
+    outcome = run_of(replace(situation, machine=fault), seed)
+    assert outcome.verdict == "right", outcome.story
+
+
+def test_only_an_open_bridge_is_off() -> None:
+    """At a command of zero, a closed one brakes: its current is that of the speed over the resistance."""
+    _, values = simulate(STOPS, 36.0, 1)
+    stop = window_of(values[2750:2950])
+    off = off_records(MOTOR, stop)
+    assert not off[:50].any()
+    assert off[50:].all()
+    braking = stop.values.copy()
+    braking[50:, 2] -= 0.038 / RESISTANCE * 10.0
+    assert not off_records(MOTOR, window_of(braking)).any()
+    broken = stop.values.copy()
+    broken[50:, 0] = 3.0
+    assert not off_records(MOTOR, window_of(broken)).any()
+
+
+@pytest.mark.parametrize(("records", "expected"), [(MIN_OFF - 1, 0), (MIN_OFF, MIN_OFF)])
+def test_a_command_of_zero_for_few_records_is_no_stop(records: int, expected: int) -> None:
+    _, values = simulate(Machine(), 4.0, 1)
+    values[100 : 100 + records, [0, 2]] = 0.0
+    assert off_records(MOTOR, window_of(values[:RECORDS])).sum() == expected
+
+
+@pytest.mark.parametrize("start", [0, 60, 150])
+def test_the_longest_part_with_the_drive_on_is_used(start: int) -> None:
+    _, values = simulate(Machine(), 4.0, 1)
+    values[start : start + 50, [0, 2]] = 0.0
+    part = running_part(MOTOR, window_of(values[200:400] if start == 0 else values[:RECORDS]))
+    if start == 0:
+        assert part is None
+        return
+    assert part is not None
+    assert part.window is not None
+    assert part.window.records == max(start, RECORDS - start - 50)
+    assert np.all(part.window.column("V_a") != 0.0)
+
+
+def test_nothing_is_used_of_a_window_with_short_parts() -> None:
+    _, values = simulate(Machine(), 4.0, 1)
+    values[40:160, [0, 2]] = 0.0
+    part = running_part(MOTOR, window_of(values[:RECORDS]))
+    assert part is not None
+    assert part.window is None
+    assert "1.2 s" in part.note
