@@ -7,7 +7,17 @@ from otolith.health.limits import Level
 from otolith.health.observations import MIN_RETURNS, PERSISTENT_WINDOWS, RELEASE_WINDOWS
 from otolith.health.schema import EventChange, FindingKind, Status
 from otolith.health.text import duration_text
-from tests.health.test_events import LENGTH, NOMINAL, SENSOR, assessed, changes, events, report, sensor_reports
+from tests.health.test_events import (
+    LENGTH,
+    NOMINAL,
+    SENSOR,
+    assessed,
+    changes,
+    events,
+    of_length,
+    report,
+    sensor_reports,
+)
 
 
 def test_an_open_test_that_a_machine_at_rest_cannot_decide_does_not_clear_the_event_of_a_sensor() -> None:
@@ -140,3 +150,25 @@ def test_an_event_that_is_there_again_says_nothing_of_the_time_without_it() -> N
     assert any("not seen for" in text for text in texts)
     assert all(text.count("not seen for") <= 1 for text in texts)
     assert "not seen for" not in documents[48].events[0].text
+
+
+@pytest.mark.parametrize(("pause", "expected"), [(0.3, 0), (1.5, 0), (4.0, 1)])
+@pytest.mark.parametrize("length", [0.1, 0.5])
+def test_what_is_gone_for_less_than_seconds_is_one_change_however_short_the_windows(
+    length: float, pause: float, expected: int
+) -> None:
+    """A transient of 10 s with windows that agree between is one change; four that are seconds apart come and go."""
+    doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": "", "text": "R_a or V_a"})
+    between = round(pause / length) + 1
+    until = round((10.0 if expected == 0 else 25.0) / length)
+    documents = assessed(
+        of_length(
+            report(index, decision=WindowDecision.SUSPECTED, findings=(doubt,))
+            if index < until and index % between == 0
+            else report(index),
+            length,
+        )
+        for index in range(until + 20)
+    )
+    raised = [change for _, change, _ in changes(documents) if change is EventChange.RAISED]
+    assert len(raised) == expected

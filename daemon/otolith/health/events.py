@@ -272,8 +272,9 @@ def _with_doubts(state: HealthState, report: ReportDocument) -> HealthState:
 
     Windows that were missed or have bad data end no doubt: between two doubtful windows they count as doubtful.
     """
-    now = report.window.index
-    doubtful = tuple(index for index in state.doubtful if now - RELEASE_WINDOWS < index < now)
+    now, length = report.window.index, report.window.end - report.window.start
+    memory = Persistence(within=RELEASE_WINDOWS).of_windows(length).within
+    doubtful = tuple(index for index in state.doubtful if now - memory < index < now)
     if report.decision in ACCEPTED:
         return replace(state, doubtful=doubtful, agreed=now)
     if report.decision not in NO_EVIDENCE:

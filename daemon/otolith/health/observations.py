@@ -49,6 +49,11 @@ BY_THE_TWIN = frozenset({FindingKind.UNEXPLAINED, FindingKind.RETURNS, FindingKi
 NOTHING = FindingFeatures(FindingKind.OPEN)
 
 
+def least_windows(length: float) -> int:
+    """Return how many windows of ``length`` (s) make :data:`PERSISTENT_SECONDS`."""
+    return math.ceil(PERSISTENT_SECONDS / length - 1e-9) if length > 0.0 else 1
+
+
 @dataclass(frozen=True, slots=True)
 class Persistence:
     """How many windows in a row must agree."""
@@ -59,7 +64,7 @@ class Persistence:
 
     def of_windows(self, length: float) -> "Persistence":
         """Return how many windows of ``length`` (s) must agree: short ones for :data:`PERSISTENT_SECONDS` as well."""
-        least = math.ceil(PERSISTENT_SECONDS / length - 1e-9) if length > 0.0 else 1
+        least = least_windows(length)
         ratio = max(least / PERSISTENT_WINDOWS, 1.0)
         rise, fall = (max(own, least) if own >= PERSISTENT_WINDOWS else own for own in (self.rise, self.fall))
         return Persistence(rise, fall, math.ceil(ratio * self.within))
@@ -178,7 +183,8 @@ def _of_returns(
 ) -> Observation:
     """Return whether something changes again and again, but never for long enough to be an event of its own."""
     key, once, features = "returns", Persistence(rise=1, fall=1), FindingFeatures(FindingKind.RETURNS, report.twin)
-    begins = [index for index in doubtful if index - 1 not in doubtful]
+    least = least_windows(report.window.end - report.window.start)  # what is gone for less is one change
+    begins = [now for before, now in zip((-least - 1, *doubtful), doubtful, strict=False) if now - before > least]
     is_shown = len(begins) >= MIN_RETURNS and doubtful[-1] == report.window.index
     of_machine = [level for name, level in before.items() if name != key and not name.startswith(OUTPUT)]
     if not is_shown or any(level not in (Level.OK, Level.HINT) for level in of_machine):
