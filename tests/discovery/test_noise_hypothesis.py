@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.changes.healthy import MACHINES, cases
+from benchmarks.changes.healthy import MACHINES, Ageing, cases
 from benchmarks.changes.machines import DC_MOTOR, SERVO_AXIS, SERVO_AXIS_DIRECTIONAL
 from benchmarks.changes.observe import Case, recordings
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Values
@@ -16,9 +16,10 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import initial_state
 from otolith.discovery.alternatives import WindowDecision, describe_noise
 from otolith.discovery.hypotheses import FittedHypothesis, nothing_happened
-from otolith.discovery.noise_hypothesis import noisier_signals
+from otolith.discovery.noise_hypothesis import noisier_signals, prior_inflation
 from otolith.discovery.screening import linearised
 from otolith.estimation.information import initial_prior
+from otolith.estimation.window_fit import estimate
 from otolith.health.schema import Status
 from tests.discovery.test_search import initial, run, simulated
 from tests.messages import assert_says
@@ -101,6 +102,29 @@ def test_noise_of_a_measured_input_is_named_and_no_component_is_adopted() -> Non
     torque, throttle = state.problem.input_noise
     assert torque == 0.0
     assert throttle == pytest.approx(LOAD_NOISE, rel=0.35)
+
+
+@pytest.mark.parametrize("machine", [row for row in MACHINES if row.load == "T_load"], ids=lambda row: row.plant.name)
+def test_earlier_windows_scatter_by_what_noise_adds_to_their_prior(machine: Ageing) -> None:
+    """They were weighted as if the load torque had no noise: the right weights for the noise would be more precise."""
+    (case,) = cases(60, [f"{machine.plant.name}: load noise"])
+    (windows,) = recordings(case, case.problem, [0], seed=3)
+    problem, prior = case.problem, initial_prior(case.problem)
+    known = replace(prior, covariance=1e-6 * prior.covariance)  # by earlier windows
+    truth = np.array([case.plant.parameters[parameter.name] for parameter in problem.free])
+    levels = np.array(problem.levels)
+    levels[[source.name for source in problem.base_model.inputs].index(machine.load)] = machine.load_noise
+    noisy, deviations = problem.with_levels(levels.tolist()), []
+    for window in windows:
+        alone, stated = estimate(problem, window, prior, truth), linearised(problem, window, known, truth)
+        fitted = replace(stated, problem=noisy).linearised_at_end()
+        inflation = prior_inflation(stated, fitted)[: len(truth)]
+        sd = np.array([own.sd for own in alone.parameters]) / alone.fit.inflation  # as without any correction
+        deviations.append((np.array([own.value for own in alone.parameters]) - truth) / sd / inflation)
+    scatter = np.sqrt(np.mean(np.square(deviations), axis=0))
+    assert (scatter > 0.73).all()  # three standard deviations of that of 60 windows
+    assert (scatter < 1.27).all()
+    assert (prior_inflation(linearised(problem, window, prior, truth), fitted) == 1.0).all()  # nothing was known
 
 
 def test_errors_of_a_sensor_are_no_noise_of_an_input_that_is_smooth() -> None:

@@ -244,28 +244,33 @@ class LinearResponse(ProjectedResponse):
         The first is with the remainder. The others are with random vectors after projection, whose covariance is the
         projector: their mean square is the squared length of the projected response.
         """
-        return self._adjoint(self._linear)
+        return self._adjoint(self._linear, self._vectors)
 
-    def _adjoint(self, linear: LinearisedModel) -> Array:
+    @cached_property
+    def _vectors(self) -> Array:
+        """(residuals, 1 + PROBES): the remainder, and probes. If the noise is as stated, all are distributed alike."""
         vectors = _probes(self.problem.seed + self.window.index % PROBE_SETS, len(self._unknowns.basis))
         probes = self._unknowns.left(vectors)[: len(self._basis)]
-        signals = np.concatenate([self._remainder[:, None], probes], axis=1)
-        return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, signals)
+        return np.concatenate([self._remainder[:, None], probes], axis=1)
 
-    def squares_of_noise(self) -> Array:
-        """(signals + states, 1 + PROBES) of squares: of the inner product with white noise of level one at each place.
+    def _adjoint(self, linear: LinearisedModel, vectors: Array) -> Array:
+        return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, vectors)
 
-        Places are those of :attr:`Problem.levels`. The first column is that of the remainder, the others are of probes:
-        if the noise is as stated, all are distributed alike.
+    def squares_of_noise(self, vectors: Array | None = None) -> Array:
+        """(signals + states, vectors) of squares: of the inner product with white noise of level one at each place.
+
+        Places are those of :attr:`Problem.levels`. By default, ``vectors`` (residuals, vectors) are the remainder and
+        the probes.
         """
-        twin, linear = self.problem.base_model, self._linear
-        names, of_sites = [site.name for site in sites(twin)], (self._adjoint_signals**2).sum(axis=0)
+        twin, linear, own = self.problem.base_model, self._linear, self._vectors if vectors is None else vectors
+        signals = self._adjoint_signals if vectors is None else self._adjoint(linear, own)
+        names, of_sites = [site.name for site in sites(twin)], (signals**2).sum(axis=0)
         of_signals = of_sites[[names.index(sensor_site(signal)) for signal in twin.signals]]
         records, size, count = len(linear.transition), linear.transition.shape[1], len(twin.states)
         each = np.ascontiguousarray(np.broadcast_to(np.eye(size, count), (records, size, count)))
         nothing = np.zeros((records, len(twin.outputs), count))
         disturbed = linear._replace(input_now=each, input_next=np.zeros(each.shape), feedthrough=nothing)
-        of_states = self._adjoint(disturbed) ** 2
+        of_states = self._adjoint(disturbed, own) ** 2
         return np.concatenate([of_signals, np.tensordot(self.window.grid.steps, of_states, axes=(0, 0))])
 
     def score_parameters(self, names: list[str]) -> Array:

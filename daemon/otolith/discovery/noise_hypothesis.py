@@ -17,7 +17,7 @@ from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypot
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
 from otolith.estimation.evidence import DECISIVE, LogEvidence
-from otolith.estimation.information import information
+from otolith.estimation.information import MIN_SINGULAR, initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
 
@@ -91,16 +91,21 @@ def _at_larger_levels(around: Fit, null: Fit, max_deviance: float) -> Fit | None
 def prior_inflation(null: Fit, trial: Fit) -> Array:
     """Return factors (2 free,) on the standard deviations of the prior of ``null``: earlier windows were as noisy.
 
-    Each standard deviation grows by as much as that of the window alone grows with the noise of ``trial``. Trends
-    follow the parameters.
+    They were weighted by the noise of ``null``, not by that of ``trial``. Least squares with other weights than those
+    of the noise have the covariance J⁺ Σ J⁺ᵀ (H. White, Econometrica 48, 1980), where Σ is that of the whitened
+    residuals: I, and what the difference of each level adds. Trends follow the parameters. Nothing becomes less certain
+    than before any window.
     """
     rows, free = len(null.prior.mean), len(null.problem.free)
-    known, own = (
-        information(jacobian[:-rows], np.ones(jacobian.shape[1]), 1.0).sd[:free]
-        for jacobian in (null.result.first[2], trial.result.first[2])
-    )
-    ratios = np.divide(own, known, out=np.ones(free), where=np.isfinite(own) & np.isfinite(known))
-    return np.resize(np.maximum(ratios, 1.0), rows)
+    jacobian = np.delete(null.result.first[2][:-rows], np.s_[free : 2 * free], axis=1)  # trends are nearly known
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = np.divide(jacobian, size, out=np.zeros(jacobian.shape), where=size > 0.0)
+    estimators = np.ascontiguousarray(np.linalg.pinv(scaled, rcond=MIN_SINGULAR)[:free].T)
+    known, added = (estimators**2).sum(axis=0), np.array(trial.problem.levels) ** 2 - np.array(null.problem.levels) ** 2
+    more = added @ LinearResponse(null).squares_of_noise(estimators)
+    ratios = np.sqrt(1.0 + np.divide(more, known, out=np.zeros(free), where=np.isfinite(more) & (more > 0.0)))
+    without_any_window = initial_prior(null.problem).sd / null.prior.sd
+    return np.maximum(np.minimum(np.resize(ratios, rows), without_any_window), 1.0)
 
 
 def _hypothesis(fitted: Fit, null: FittedHypothesis) -> FittedHypothesis:
