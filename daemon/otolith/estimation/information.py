@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from itertools import islice, takewhile
+from itertools import islice
 
 import numpy as np
 
@@ -33,13 +33,12 @@ MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: with a wider one it is open whether the value is beyond the bound
 PRESSED = 3.0  # standard deviations by which a step without bounds must pass a bound: the value is beyond it
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
-MIN_INFLATED_COST = 1.1  # cost above which the residual is tested for autocorrelation: noise alone hardly reaches it
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
 NOISE_DRAWS = 8  # of the noise of inputs, by which its bias is estimated
 NEGLIGIBLE_BIAS = 0.02  # standard deviations of a window: a smaller bias is not corrected
 MIN_KEPT_INFORMATION = 0.5  # share of the information of a direction that is not by the noise of inputs; less is noise
 INFORMATION_OF_NOISE = 0.01  # share of the information of a direction that noise has determined: far less than stated
-CORRELATED = 2.0  # long-run variance over variance above which an autocorrelation is not chance
+CORRELATED = 3.0  # standard deviations of autocovariances of white noise: what is smaller is chance
 WIDEN_BOUNDS = "widen the bounds in [parameters], or check the equations of the twin"
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
@@ -152,25 +151,48 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
 
 
 def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
-    """Return the factor on standard deviations for a residual larger than the noise.
+    """Return the factor on standard deviations for a residual larger than the noise, or correlated.
 
-    ``residuals`` (records, outputs) are whitened; those ``present`` count. What exceeds the noise is correlated from
-    sample to sample and does not average out, so its long-run variance counts (W. K. Newey, K. D. West, Econometrica
-    55, 1987), summed up to the first lag without correlation. White residuals show a correlation by chance, always of
-    one sign; up to that size their variance alone counts.
+    ``residuals`` (records, outputs) are whitened; those ``present`` count. What is correlated from sample to sample
+    does not average out, so the largest long-run variance of an output counts (W. K. Newey, K. D. West, Econometrica
+    55, 1987), as far as it exceeds the variance of all of them by more than chance.
     """
-    if cost <= MIN_INFLATED_COST:
-        return max(cost, 1.0)
-    long_run = cost**2
+    variance = long_run = max(cost, 1.0) ** 2
     for column, measured in zip(residuals.T, present.T, strict=True):
         series = column if measured.all() else column[measured]
-        records = len(series)
-        lags = range(1, max(int(MAX_LAG * records), 1))
-        covariances = (float(series[lag:] @ series[:-lag]) / records for lag in lags)
-        variance = float(series @ series) / max(records, 1)
-        total = variance + 2.0 * sum(takewhile(lambda covariance: covariance > 0.0, covariances))
-        long_run = max(long_run, total if total > CORRELATED * variance else variance)
+        long_run = max(long_run, _long_run_variance(series, variance))
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
+
+
+def _long_run_variance(series: Array, expected: float) -> float:
+    """Return the variance of ``series`` plus twice its autocovariances, both as far as white noise would not show them.
+
+    White noise of the variance ``expected`` has no autocovariances, and n values of it show only chance: a variance
+    with the relative standard deviation √(2/n), and sums of m autocovariances with √(m/n) (M. S. Bartlett, 1946). What
+    lies within ``CORRELATED`` of these is chance; what is larger shrinks as by the positive-part rule (W. James, C.
+    Stein, 1961). Lags of 1, 2 to 3, 4 to 7 and so on are summed. A negative sum ends the correlation (initial positive
+    sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CORRELATED`` it does so by degrees.
+    """
+    records = len(series)
+    variance = float(series @ series) / max(records, 1)
+    if variance == 0.0 or not np.isfinite(variance):
+        return variance
+    by_chance, lags = CORRELATED * variance / np.sqrt(records), int(MAX_LAG * records)
+    own = min(variance, expected) + float(_beyond(variance - expected, np.sqrt(2.0) * by_chance))
+    if lags < 2:
+        return own
+    spectrum = np.abs(np.fft.rfft(series, 2 ** (records + lags).bit_length())) ** 2
+    starts = 2 ** np.arange((lags - 1).bit_length()) - 1
+    sums = np.add.reduceat(np.fft.irfft(spectrum)[1:lags] / records, starts)
+    limits = by_chance * np.sqrt(np.diff(starts, append=lags - 1))
+    kept = np.minimum.accumulate(np.clip(1.0 + sums / limits, 0.0, 1.0))
+    return own + 2.0 * float(np.sum(kept * _beyond(sums, limits)))
+
+
+def _beyond(values: Array | float, by_chance: Array | float) -> Array:
+    """Return what is left of ``values`` of which up to ``by_chance`` is chance: none of it, up to all."""
+    larger = np.maximum(values, by_chance)
+    return np.asarray(larger * (1.0 - (by_chance / larger) ** 2))
 
 
 @dataclass(frozen=True, slots=True)
