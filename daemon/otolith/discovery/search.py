@@ -26,6 +26,7 @@ from otolith.discovery.hypotheses import (
     Proposal,
     all_parameters_moved,
     delay_score,
+    evidence_factor,
     is_possible,
     largest_chi_square,
     nothing_happened,
@@ -131,7 +132,7 @@ def _threshold_gain(response: LinearResponse) -> float:
     best = -np.inf
     for fitted in fit_hypotheses(proposals, response.window):
         count = fitted.fit.count
-        divisor = discount(fitted.chi_square, count)
+        divisor = evidence_factor([fitted])
         # The initial prior leaves all parameters free, so that the penalty counts them beside those of the component.
         stated = replace(fitted.hypothesis, added=fitted.hypothesis.added + len(problem.free))
         best = max(best, (response.chi_square - fitted.chi_square) / divisor - stated.penalty(count))
@@ -191,7 +192,7 @@ def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis
         if _convincing([*fitted, *more]) not in (None, best):
             break
         further = _best_of(_with_another_component(best, MAX_CANDIDATES // 2))
-        if further is None or _gain(further, best) / discount(further.chi_square, best.fit.count) <= DECISIVE:
+        if further is None or _gain(further, best) <= DECISIVE:
             break
         more += [further, *_sub_structures(further, [*fitted, *more])]
         best = further
@@ -294,8 +295,7 @@ def _chi_square(fitted: FittedHypothesis) -> float:
 
 def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
     """Return the best hypothesis if it explains the window decisively, with at most one component added."""
-    null, count = fitted[0], fitted[0].fit.count
-    divisor = discount(min(map(_chi_square, fitted)), count)
+    null, count, divisor = fitted[0], fitted[0].fit.count, evidence_factor(fitted)
     best = min(fitted, key=lambda item: item.evidence(count, divisor).deviance)
     gain = null.evidence(count, divisor).over(best.evidence(count, divisor))
     added = len(best.problem.components) - len(null.problem.components)
@@ -366,9 +366,9 @@ def _best_of(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
 
 
 def _gain(further: FittedHypothesis, before: FittedHypothesis) -> float:
-    """Return by how much -2 log evidence falls from ``before`` to ``further``, not discounted."""
-    count = before.fit.count
-    return before.evidence(count, 1.0).over(further.evidence(count, 1.0))
+    """Return by how much -2 log evidence falls from ``before`` to ``further``."""
+    count, divisor = before.fit.count, evidence_factor([further])
+    return before.evidence(count, divisor).over(further.evidence(count, divisor))
 
 
 def _with_another_component(fitted: FittedHypothesis, first: int = MAX_CANDIDATES) -> list[FittedHypothesis]:

@@ -401,7 +401,7 @@ def _with_noise(steps: list[HypothesisStep]) -> list[HypothesisStep]:
 
 def _with_evidence(steps: list[HypothesisStep]) -> list[HypothesisStep]:
     """Return the steps with the evidence of the window."""
-    divisor = discount(min(step.fitted.unexplained for step in steps), steps[0].fitted.fit.count)
+    divisor = evidence_factor(step.fitted for step in steps)
     penalties = (complexity_penalty(step.predicted, step.evidence) for step in steps)
     return [
         replace(step, log_evidence=LogEvidence(step.fitted.chi_square, penalty, divisor))
