@@ -260,18 +260,20 @@ class LinearResponse(ProjectedResponse):
         """(signals + states, vectors) of squares: of the inner product with white noise of level one at each place.
 
         Places are those of :attr:`Problem.levels`. By default, ``vectors`` (residuals, vectors) are the remainder and
-        the probes.
+        the probes. A square may be infinite where the twin diverges.
         """
         twin, linear, own = self.problem.base_model, self._linear, self._vectors if vectors is None else vectors
         signals = self._adjoint_signals if vectors is None else self._adjoint(linear, own)
-        names, of_sites = [site.name for site in sites(twin)], (signals**2).sum(axis=0)
-        of_signals = of_sites[[names.index(sensor_site(signal)) for signal in twin.signals]]
+        names = [site.name for site in sites(twin)]
         records, size, count = len(linear.transition), linear.transition.shape[1], len(twin.states)
         each = np.ascontiguousarray(np.broadcast_to(np.eye(size, count), (records, size, count)))
         nothing = np.zeros((records, len(twin.outputs), count))
         disturbed = linear._replace(input_now=each, input_next=np.zeros(each.shape), feedthrough=nothing)
-        of_states = self._adjoint(disturbed, own) ** 2
-        return np.concatenate([of_signals, np.tensordot(self.window.grid.steps, of_states, axes=(0, 0))])
+        with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges
+            of_sites, of_states = (signals**2).sum(axis=0), self._adjoint(disturbed, own) ** 2
+            of_states = np.tensordot(self.window.grid.steps, of_states, axes=(0, 0))
+        of_signals = of_sites[[names.index(sensor_site(signal)) for signal in twin.signals]]
+        return np.concatenate([of_signals, of_states])
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""

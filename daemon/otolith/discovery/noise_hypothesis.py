@@ -102,7 +102,8 @@ def prior_inflation(null: Fit, trial: Fit) -> Array:
     scaled = np.divide(jacobian, size, out=np.zeros(jacobian.shape), where=size > 0.0)
     estimators = np.ascontiguousarray(np.linalg.pinv(scaled, rcond=MIN_SINGULAR)[:free].T)
     known, added = (estimators**2).sum(axis=0), np.array(trial.problem.levels) ** 2 - np.array(null.problem.levels) ** 2
-    more = added @ LinearResponse(null).squares_of_noise(estimators)
+    with np.errstate(invalid="ignore"):  # where the twin diverges
+        more = added @ LinearResponse(null).squares_of_noise(estimators)
     ratios = np.sqrt(1.0 + np.divide(more, known, out=np.zeros(free), where=np.isfinite(more) & (more > 0.0)))
     without_any_window = initial_prior(null.problem).sd / null.prior.sd
     return np.maximum(np.minimum(np.resize(ratios, rows), without_any_window), 1.0)
