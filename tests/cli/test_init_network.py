@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -82,9 +83,10 @@ def test_an_interval_that_was_measured_is_the_round_one_that_devices_have(measur
 def test_registers_that_are_told_become_a_file_whose_signals_come(drive: int, tmp_path: Path) -> None:
     file, target = tmp_path / "drive.toml", f"127.0.0.1:{drive}"
     told = ["--signal", "V_a=10", "--signal", "i=11", "--signal", "omega=12", "--unit", "10=V", "--unit", "11=mA",
-            "--unit", "12=rpm", "--scale", "12=0.1", "--twin", "dc_motor"]  # fmt: skip
+            "--unit", "12=rpm", "--scale", "12=0.1"]  # fmt: skip
     otolith("init", file, "--modbus", target, "--registers", "10..12", "--seconds", 1.5, *told)
     assert tables(file)["driver"]["host"] == "127.0.0.1"
+    assert tables(file)["twin"]["name"] == "dc_motor", "the one with these signals, although registers fit others too"
     assert tables(file)["signals"]["omega"] == {"register": 12, "type": "int16", "unit": "rpm", "scale": 0.1}
     assert tables(file)["signals"]["T_load"] == {"unknown": "constant"}
     assert otolith("check", file).return_value == 0
@@ -121,6 +123,31 @@ def test_values_off_the_display_say_which_register_is_what(tmp_path: Path) -> No
     assert signals["V_a"] == {"register": 10, "type": "int16", "unit": "V", "scale": 0.1}
     assert signals["i"] == {"register": 11, "type": "int16", "unit": "A", "scale": 0.001}
     assert signals["omega"] == {"register": 12, "type": "int16", "unit": "rpm", "scale": 1.0}
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.1, 0.3, 0.45, 0.6, 0.95])
+def test_values_of_one_moment_are_found_while_the_machine_moves(
+    moment: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A voltage in 0.1 V, a current in mA, a speed in 0.1 rpm, and a count of seconds that passes the voltage."""
+    phase = np.linspace(0.0, 2.0 * math.pi, 1000)
+    values = {
+        "10": 240.0 + 40.0 * np.sin(phase), "11": 2310.0 + 400.0 * np.sin(phase - 0.5),
+        "12": 14500.0 + 3000.0 * np.sin(phase - 1.0), "13": 225.0 + 5.0 * phase,
+    }  # fmt: skip
+    offers = [Offer(name, None, {}, np.round(row)) for name, row in values.items()]
+    volts, amperes, rpm = (float(np.interp(moment, phase / phase[-1], values[name])) for name in ("10", "11", "12"))
+    shown = Answers(
+        displays={"V_a": f"{volts / 10:.1f} V", "i": f"{amperes / 1e3:.2f} A", "omega": f"{rpm / 10:.0f} rpm"}
+    )
+    found = with_displays(shown, offers, [find_twin("dc_motor")])
+    assert dict(found.signals) == {"V_a": "10", "i": "11", "omega": "12"}
+    assert {name: float(scale) for name, scale in found.scales.items()} == {"10": 0.1, "11": 1e-3, "12": 0.1}
+    assert found.units["12"] == "rpm"
+    for apart in ({"V_a": "28 V", "i": "1.91 A", "omega": "1750 rpm"}, {"V_a": "28.8 V"}):  # the last is 3 % too much
+        with raises_saying(ConfigurationError, "--display", "--seconds", "200", "280"):
+            displays = {"i": "2.61 A", "omega": "1602 rpm", **apart}
+            with_displays(replace(shown, displays=displays), offers, [find_twin("dc_motor")])
 
 
 @pytest.mark.parametrize("held", [{"10": 241.0, "11": 2310.0}, {}], ids=len)

@@ -54,9 +54,15 @@ class TwinProposal:
         return not self.missing
 
 
-def rank(twins: Sequence[Definition], offers: Sequence[Offer], hint: str = "") -> list[TwinProposal]:
+def rank(
+    twins: Sequence[Definition],
+    offers: Sequence[Offer],
+    hint: str = "",
+    given: Mapping[str, Offer] | None = None,
+    unmeasured: Collection[str] = (),
+) -> list[TwinProposal]:
     """Return a proposal for each twin, the best first; ``hint`` is a text that may name the kind of machine."""
-    proposals = [propose(twin, offers, hint=hint) for twin in twins]
+    proposals = [propose(twin, offers, given, unmeasured, hint) for twin in twins]
     return sorted(proposals, key=lambda row: (not row.fits, -row.points, len(row.missing), _estimated(row.twin)))
 
 

@@ -128,16 +128,19 @@ def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
 
 def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, questions: Questions) -> TwinProposal:
     """Return the twin that fits best, or the one that was told; raise ConfigurationError if none fits."""
-    ranked = rank([find_twin(name) for name in library_twins()], offers, source.title)
+    known = {offer.name: offer for offer in offers}
+    given = {signal: _offer_named(text, known) for signal, text in answers.signals.items()}
+    twins, told = [find_twin(name) for name in library_twins()], given.keys() | answers.unknown.keys()
+    having = [twin for twin in twins if told <= set(twin.signals)] or twins
+    ranked = rank(having, offers, source.title, given, answers.unknown)
     fitting = [row for row in ranked if row.fits]
     if len(fitting) > 1:
         echo(f"twins that fit: {', '.join(row.twin.name for row in fitting)}")
     name = questions.text("Twin", answers.twin or ranked[0].twin.name, lambda text: find_twin(text).name)
-    twin, known = find_twin(name), {offer.name: offer for offer in offers}
+    twin = find_twin(name)
     for signal in [*answers.signals, *answers.unknown]:
         if signal not in twin.signals:
             raise ConfigurationError(f"twin {name} has no signal {signal!r}: it has {', '.join(twin.signals)}")
-    given = {signal: _offer_named(text, known) for signal, text in answers.signals.items()}
     for signal, offer in given.items():
         _check_unit(twin, signal, offer, offer.unit or twin.unit_of(signal))
     proposal = propose(twin, offers, given, answers.unknown)

@@ -4,12 +4,16 @@ Registers have neither names nor units. Drives scale them by powers of ten, so t
 of these, is what the register holds. Some hold another usual unit than the display shows, as rad/s where that has rpm.
 0.1 rad/s is nearly 1 rpm, and a display is read earlier than a register. So a value that is close as displayed is taken
 so, unless it is exact in another unit only; where both are close, both are named.
+
+The values of a display are those of one moment. While the machine moves, they are looked for together in each moment of
+what was read, and the moment with the closest ones says which registers they are.
 """
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +29,7 @@ from otolith_drivers.units import are_equal, factor
 # Engineering choices: docs/reference/thresholds-cli.md.
 POWERS = range(-5, 4)  # of ten, by which a drive scales a register
 CLOSE = 0.05  # of the displayed value: how far a register may be from it
+CLOSE_IN_MOTION = 0.02  # the same, where a register moves by more than CLOSE: many would pass a wrong value
 AS_CLOSE = 0.01  # of the displayed value: less is exact; registers and units that differ by less are both named
 USUAL = (  # units of one quantity between which displays and registers differ by no power of ten
     ("rpm", "rad/s", "turn/s"),
@@ -37,6 +42,7 @@ USUAL = (  # units of one quantity between which displays and registers differ b
     ("N", "lbf"),
 )
 UNLIKELY = 1e6  # distance of what cannot be the same
+MOMENTS = 100  # at most, into which the readings are divided
 
 
 def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Definition]) -> Answers:
@@ -50,30 +56,49 @@ def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Def
     twin = _twin_of(answers, twins)
     shown = {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
     names = [name for name in shown if name not in answers.signals]
-    readings = [[_readings(shown[name], offer, answers.units.get(offer.name)) for offer in offers] for name in names]
-    pairs = _assigned(readings)
-    found = {names[at] for at, place in pairs if _chosen(readings[at][place]).distance <= CLOSE}
-    if lost := [f"{name}={answers.displays[name]}" for name in names if name not in found]:
+    values, moments = [shown[name] for name in names], _moments(offers)
+    moves = [_moves(track) for track in zip(*moments, strict=True)]
+    fits = [_Fit(moment, values, offers, answers.units, moves) for moment in moments]
+    best = min(fits, key=lambda fit: fit.cost)
+    if lost := [f"{names[at]}={answers.displays[names[at]]}" for at in range(len(names)) if at not in best.found]:
         raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(offers)}")
     signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
-    for at, place in pairs:
-        name, offer, reading = names[at], offers[place], _chosen(readings[at][place])
-        power = _power(reading.value, offer)
+    as_good = [fit for fit in fits if fit.cost <= best.cost + AS_CLOSE]
+    for at, place in best.found.items():
+        name, offer, reading = names[at], offers[place], best.chosen(at, place)
+        power, held = _power(reading.value, best.held[place]), best.held[place]
         signals[name] = offer.name
         units.setdefault(offer.name, reading.unit)
         scales.setdefault(offer.name, f"{10.0**power:g}")
-        held = f"{float(np.median(offer.values)):.5g}·10^{power} in register {offer.name}"
-        echo(f"{name}: {reading.value:g} {reading.unit} is {held}")
-        distances = [_distance(reading.value, row) for row in offers]
-        equal = [row.name for row, far in zip(offers, distances, strict=True) if far <= reading.distance + AS_CLOSE]
-        if others := [other for other in equal if other != offer.name]:
+        echo(f"{name}: {reading.value:g} {reading.unit} is {held:.5g}·10^{power} in register {offer.name}")
+        equal = {row for fit in as_good for row in fit.equal(at, reading.value)}
+        if others := [row.name for number, row in enumerate(offers) if number in equal and number != place]:
             remedy = f"another speed or load decides, or --signal {name}=REGISTER"
             echo(f"! {', '.join(others)} would fit {name} as well: {remedy}")
-        for other in _rivals(readings[at][place]):
-            own = f"--unit {offer.name}={other.unit} --scale {offer.name}={10.0 ** _power(other.value, offer):g}"
+        for other, number in best.rivals(at, place):
+            own = f"--unit {offer.name}={other} --scale {offer.name}={10.0**number:g}"
             remedy = f"read the display again while the machine runs steadily, or {own}"
-            echo(f"! {other.unit} would fit {name} in register {offer.name} as well: {remedy}")
+            echo(f"! {other} would fit {name} in register {offer.name} as well: {remedy}")
     return replace(answers, twin=twin.name, signals=signals, units=units, scales=scales)
+
+
+def _moments(offers: Sequence[Offer]) -> list[list[float]]:
+    """Return what all registers hold at each of at most MOMENTS times, NaN of one without a number.
+
+    All are read in turn, so that equal shares of their values are of the same time. A median is without noise.
+    """
+    longest = max((len(offer.values) for offer in offers), default=0)
+    count = max(1, min(MOMENTS, longest))
+    tracks = [
+        [float(np.median(part)) if len(part) else math.nan for part in np.array_split(offer.values, count)]
+        for offer in offers
+    ]
+    return [[track[at] for track in tracks] for at in range(count)]
+
+
+def _moves(track: Sequence[float]) -> bool:
+    """Whether a register differs by more than a displayed value may at one moment."""
+    return bool(np.nanmax(np.abs(track)) - np.nanmin(np.abs(track)) > CLOSE * np.nanmedian(np.abs(track)))
 
 
 class _Reading(NamedTuple):
@@ -84,7 +109,50 @@ class _Reading(NamedTuple):
     distance: float  # From what the register holds, in shares of it
 
 
-def _readings(shown: tuple[float, str], offer: Offer, told: str | None) -> list[_Reading]:
+class _Fit:
+    """Which register is best for which displayed value, by what the registers ``held`` at one moment."""
+
+    def __init__(
+        self,
+        held: Sequence[float],
+        shown: Sequence[tuple[float, str]],
+        offers: Sequence[Offer],
+        told: Mapping[str, str],
+        moves: Sequence[bool],
+    ) -> None:
+        self.held = held
+        registers = list(zip(held, offers, strict=True))
+        self._readings = [
+            [_readings(value, number, told.get(offer.name)) for number, offer in registers] for value in shown
+        ]
+        costs = np.array([[_cost(readings) for readings in row] for row in self._readings])
+        costs = costs.reshape(len(shown), len(offers))
+        pairs = list(zip(*map(np.ndarray.tolist, linear_sum_assignment(costs)), strict=True))
+        close = [(at, place) for at, place in pairs if costs[at, place] < UNLIKELY]
+        limit = CLOSE_IN_MOTION if any(moves[place] for _, place in close) else CLOSE
+        self.found = {at: place for at, place in close if self.chosen(at, place).distance <= limit}
+        """Register by displayed value."""
+        self.cost = sum(costs[pair] for pair in self.found.items()) + UNLIKELY * (len(shown) - len(self.found))
+
+    def chosen(self, at: int, place: int) -> _Reading:
+        """Return the reading of a register that is right for a displayed value."""
+        return _chosen(self._readings[at][place])
+
+    def equal(self, at: int, value: float) -> list[int]:
+        """Return the registers that hold a value about as well as the best one for it."""
+        closest = self.chosen(at, self.found[at]).distance
+        return [place for place, held in enumerate(self.held) if _distance(value, held) <= closest + AS_CLOSE]
+
+    def rivals(self, at: int, place: int) -> list[tuple[str, int]]:
+        """Return the units, and powers of ten, that may be right in place of the chosen ones."""
+        readings = self._readings[at][place]
+        chosen = _chosen(readings)
+        limits = [CLOSE, *[min(CLOSE, chosen.distance + AS_CLOSE) for _ in readings[1:]]]
+        others = [each for each, limit in zip(readings, limits, strict=True) if each.distance <= limit]
+        return [(each.unit, _power(each.value, self.held[place])) for each in others if each != chosen]
+
+
+def _readings(shown: tuple[float, str], held: float, told: str | None) -> list[_Reading]:
     """Return a displayed value in the unit that was ``told`` of a register; else as it is, then in usual units."""
     value, unit = shown
     units = [unit, *_other_units(unit)] if told is None else [told]
@@ -93,7 +161,7 @@ def _readings(shown: tuple[float, str], offer: Offer, told: str | None) -> list[
         with contextlib.suppress(ValueError):
             scale, offset = (1.0, 0.0) if other == unit else factor(unit, other)
             number = scale * value + offset
-            converted.append(_Reading(number, other, _distance(number, offer)))
+            converted.append(_Reading(number, other, _distance(number, held)))
     return converted or [_Reading(value, unit, UNLIKELY)]
 
 
@@ -104,20 +172,6 @@ def _chosen(readings: Sequence[_Reading]) -> _Reading:
     return first if first.distance <= CLOSE and not is_exact_alone else closest
 
 
-def _rivals(readings: Sequence[_Reading]) -> list[_Reading]:
-    """Return the readings that may be right in place of the chosen one."""
-    chosen = _chosen(readings)
-    limits = [CLOSE, *[min(CLOSE, chosen.distance + AS_CLOSE) for _ in readings[1:]]]
-    return [each for each, limit in zip(readings, limits, strict=True) if each != chosen and each.distance <= limit]
-
-
-def _assigned(readings: Sequence[Sequence[Sequence[_Reading]]]) -> list[tuple[int, int]]:
-    """Return which register is best for which value."""
-    costs = np.array([[_cost(each) for each in registers] for registers in readings])
-    costs = costs.reshape(len(readings), len(readings[0]) if readings else 0)
-    return list(zip(*map(np.ndarray.tolist, linear_sum_assignment(costs)), strict=True))
-
-
 def _cost(readings: Sequence[_Reading]) -> float:
     """Return the distance; one that is close as displayed is better than in another unit, and all others are alike."""
     distance = _chosen(readings).distance
@@ -126,21 +180,24 @@ def _cost(readings: Sequence[_Reading]) -> float:
     return distance if readings[0].distance <= CLOSE else distance + CLOSE
 
 
-def _other_units(unit: str) -> list[str]:
+@cache
+def _other_units(unit: str) -> tuple[str, ...]:
     """Return the other units that are usual for a quantity in ``unit``."""
     for units in USUAL:
         with contextlib.suppress(ValueError):
             same = [other for other in units if are_equal(unit, other, other)]
             if same:
-                return [other for other in units if other not in same]
-    return []
+                return tuple(other for other in units if other not in same)
+    return ()
 
 
 def _not_found(offers: Sequence[Offer]) -> str:
     """Return why no register can have a displayed value, and what to do."""
-    held = ", ".join(f"{row.name}: {float(np.median(row.values)):.5g}" for row in offers if len(row.values)) or "none"
-    fault = f"no register of its own holds it times a power of ten (those that change: {held})"
-    return f"{fault}: let the machine run steadily and read the display again, or choose others by --registers"
+    ends = [(row.name, float(row.values.min()), float(row.values.max())) for row in offers if len(row.values)]
+    held = ", ".join(f"{name}: {low:.5g} to {high:.5g}" for name, low, high in ends) or "none"
+    fault = f"no register of its own holds it times a power of ten together with the other values ({held})"
+    remedy = "show values of one moment, read off a steady machine or off a photo of the display; while it moves, read"
+    return f"{fault}: {remedy} its registers for a whole cycle by --seconds 30; or choose other --registers"
 
 
 def _twin_of(answers: Answers, twins: Sequence[Definition]) -> Definition:
@@ -174,17 +231,14 @@ def _quantity(twin: Definition, name: str, text: str) -> tuple[float, str]:
     return value, unit
 
 
-def _power(value: float, offer: Offer) -> int:
-    return min(POWERS, key=lambda power: _distance_at(value, offer, power))
+def _power(value: float, held: float) -> int:
+    return min(POWERS, key=lambda power: _distance_at(value, held, power))
 
 
-def _distance(value: float, offer: Offer) -> float:
+def _distance(value: float, held: float) -> float:
     """Return how far a displayed value is from what a register holds, in shares of it, at the best power of ten."""
-    return min((_distance_at(value, offer, power) for power in POWERS), default=UNLIKELY)
+    return min((_distance_at(value, held, power) for power in POWERS), default=UNLIKELY)
 
 
-def _distance_at(value: float, offer: Offer, power: int) -> float:
-    if not len(offer.values):
-        return UNLIKELY
-    held = 10.0**power * float(np.median(offer.values))
-    return min(abs(held / value - 1.0), UNLIKELY)
+def _distance_at(value: float, held: float, power: int) -> float:
+    return min(abs(10.0**power * held / value - 1.0), UNLIKELY) if math.isfinite(held) else UNLIKELY
