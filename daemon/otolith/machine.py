@@ -36,7 +36,7 @@ from otolith.machine_file import (
 )
 from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
-from otolith.twin.language import MAX_COEFFICIENT, read_twin
+from otolith.twin.language import MAX_COEFFICIENT, read_twin, with_performance
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
@@ -180,6 +180,8 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     file = validate(data, MachineFile, source)
     context = Context(source)
     complete = _twin(file, path, context)
+    if file.performance:
+        complete = with_performance(complete, file.performance, lambda at, text: context.fail((*at,), text))
     unmeasured = _unmeasured(file, complete, source)
     twin = _without_sensors(file, complete, unmeasured, context)
     signals = {

@@ -68,6 +68,7 @@ def test_what_the_library_and_the_states_name_is_translated(language: Language) 
     for twin in twins:
         words |= {parameter.meaning for parameter in twin.parameters} | {site.meaning for site in twin.sites}
         words |= {row.meaning for rows in (twin.inputs, twin.outputs, twin.states) for row in rows} | {twin.title}
+        words |= {figure.meaning for figure in twin.performance}
         words |= {parameter.part for parameter in twin.parameters} | {site.part for site in twin.sites}
     assert words - set(texts_in(language).phrases) - {""} == set()
 

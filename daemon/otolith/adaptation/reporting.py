@@ -44,6 +44,7 @@ from otolith.health.schema import (
     FitDocument,
     NumberDocument,
     ParameterDocument,
+    PerformanceDocument,
     Report,
     ReportDocument,
     Severity,
@@ -56,9 +57,12 @@ from otolith.health.status import (
     PreviousStatus,
     WindowEvidence,
     publish,
+    publish_performance,
+    reference_values,
     some_parameter_is_determined,
     without_traded_at_a_bound,
 )
+from otolith.simulation.performance import Estimates, figures_of
 from otolith.twin.components import SourceKind
 from otolith_drivers.units import equation_text
 
@@ -164,6 +168,7 @@ def make_report(
         window=window_document(window),
         decision=result.decision,
         parameters=parameters,
+        performance=_performance(state, window, result, parameters),
         components=components,
         explanations=_explanations(undecided),
         findings=(
@@ -213,6 +218,26 @@ def _parameters(
             status = documents[parameter.name].status
             previous[parameter.label] = replace(previous[parameter.label], status=status)
     return previous, documents
+
+
+def _performance(
+    state: AdaptationState, window: Window, result: WindowResult, documents: Mapping[str, ParameterDocument]
+) -> dict[str, PerformanceDocument] | None:
+    """Return the figures of performance, with the values of the parameters as they are published."""
+    problem, observed = result.posterior.problem, window_document(window).observed or {}
+    twin = problem.base_model
+    if not twin.performance:
+        return None
+    free = [item.name for item in problem.free[: len(documents)]]
+    own, sd = result.after.covariance[: len(free), : len(free)], result.after.sd[: len(free)]
+    stated = np.array([documents[name].sd if documents[name].sd is not None else sd[k] for k, name in enumerate(free)])
+    values = dict(problem.known) | dict(zip(free, result.after.mean[: len(free)].tolist(), strict=True))
+    values |= {name: item.value for name, item in documents.items() if item.value is not None}
+    covariance = own * np.outer(stated / sd, stated / sd)
+    references = reference_values(state.plan.parameters, documents, observed)
+    predicted = None if result.estimate is None else result.estimate.predicted
+    estimates = Estimates(values, tuple(free), covariance, references)
+    return publish_performance(figures_of(twin, estimates, window, predicted), documents)
 
 
 def _marginals(result: WindowResult) -> list[MarginalPosterior]:

@@ -297,6 +297,28 @@ class ParameterDocument(DocumentModel):
     advice: str | None = None  # The experiment that would determine the parameter, if this window did not
 
 
+class PerformanceDocument(DocumentModel):
+    """A figure of performance: what the machine costs or yields."""
+
+    meaning: str
+    value: float | None = None
+    unit: str
+    sd: float | None = None
+    low: float | None = None  # Lower end of the 95 % interval, which is that of the parameters
+    high: float | None = None
+    better: Literal["lower", "higher"]
+    at: dict[str, float] | None = None  # The operating point, in the units of the twin
+    over: Literal["window", "point"]  # Whether it is the mean over the window, or the value at the operating point
+    status: Status
+    reason: str = ""
+    parameters: tuple[str, ...] = ()  # The estimated ones that it depends on
+    baseline: float | None = None  # With the healthy values of these, at the present temperature
+    at_limit: float | None = None  # With the parameter ``limited`` at its limit
+    limited: str | None = None
+    limit: float | None = None  # In the unit of that parameter, at the present temperature
+    limit_unit: str | None = None
+
+
 class FitDocument(DocumentModel):
     """How well the twin explains the window; root mean square errors per output, in the output's unit."""
 
@@ -374,6 +396,7 @@ class ReportDocument(DocumentModel):
     window: WindowDocument
     decision: WindowDecision  # What the window led to
     parameters: dict[str, ParameterDocument]
+    performance: dict[str, PerformanceDocument] | None = None  # Of twins that state figures; without the components
     components: tuple[ComponentDocument, ...] = ()  # Components in the twin
     explanations: tuple[AlternativeDocument, ...] = ()  # Hypotheses while they are undecided; most probable first
     findings: tuple[FindingDocument, ...] = ()

@@ -17,7 +17,9 @@ from otolith.estimation.information import (
     at_its_bound,
 )
 from otolith.estimation.window_fit import AT_BOUND
-from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status
+from otolith.health.limits import Level, MonitoredQuantity
+from otolith.health.schema import DriverDocument, ParameterDocument, PerformanceDocument, SourceDocument, Status
+from otolith.simulation.performance import FigureValue, ReferenceValues
 from otolith.twin.definition import Parameter
 from otolith_drivers.base import Link
 
@@ -223,3 +225,61 @@ def with_absent_sources(
         else parameter.model_copy(update={"reason": "; ".join([*absent.values(), parameter.reason])})
         for name, parameter in parameters.items()
     }
+
+
+NOT_KNOWN = "not determined yet: {}"  # Parameters on which a figure of performance depends
+
+
+def reference_values(
+    plan: Mapping[str, MonitoredQuantity], documents: Mapping[str, ParameterDocument], observed: Mapping[str, float]
+) -> dict[str, ReferenceValues]:
+    """Return healthy values and ACT limits of parameters as they would be at the present temperature."""
+    found = {}
+    for name, quantity in plan.items():
+        referred = quantity.referred(1.0, 0.0, observed)
+        if name not in documents or referred is None:
+            continue
+        healthy = None if quantity.is_example or (quantity.waiting and not quantity.has_baseline) else quantity.nominal
+        limits = tuple(item.value / referred[0] for item in quantity.limits if item.level is Level.ACT)
+        found[name] = ReferenceValues(None if healthy is None else healthy / referred[0], limits)
+    return found
+
+
+def publish_performance(
+    values: Iterable[FigureValue], documents: Mapping[str, ParameterDocument]
+) -> dict[str, PerformanceDocument] | None:
+    """Return the documents of figures of performance, each as trustworthy as the parameters that it depends on."""
+    return {item.figure.name: _performance_document(item, documents) for item in values} or None
+
+
+def _performance_document(item: FigureValue, documents: Mapping[str, ParameterDocument]) -> PerformanceDocument:
+    figure, value, sd = item.figure, item.value, item.sd
+    status, reason = Status.ESTIMATED if value is not None else Status.UNESTIMATED, item.reason
+    for worse in (Status.HELD, Status.AMBIGUOUS, Status.INVALID, Status.UNESTIMATED):
+        names = [name for name in item.parameters if documents[name].status is worse]
+        if names and value is not None:
+            known = f"as {', '.join(names)}"
+            status, reason = worse, NOT_KNOWN.format(", ".join(names)) if worse is Status.UNESTIMATED else known
+    if status is Status.UNESTIMATED or value is None or sd is None:
+        value = sd = None
+    limit_unit = documents[item.limited].unit if item.limited else None
+    is_known = value is not None
+    return PerformanceDocument(
+        meaning=figure.meaning,
+        value=value,
+        unit=figure.unit,
+        sd=sd,
+        low=None if value is None or sd is None else value - QUANTILE * sd,
+        high=None if value is None or sd is None else value + QUANTILE * sd,
+        better=figure.better,
+        at=dict(figure.at) or None,
+        over="window" if item.is_mean else "point",
+        status=status,
+        reason=reason,
+        parameters=item.parameters,
+        baseline=item.healthy if is_known else None,
+        at_limit=item.at_limit if is_known else None,
+        limited=(item.limited or None) if is_known else None,
+        limit=item.limit if is_known else None,
+        limit_unit=limit_unit if is_known else None,
+    )

@@ -29,6 +29,7 @@ from otolith.health.schema import (
     NoteDocument,
     ParameterDocument,
     PartDocument,
+    PerformanceDocument,
     ReportDocument,
     Status,
 )
@@ -141,6 +142,25 @@ def parameter_text(name: str, parameter: ParameterDocument) -> str:
     if parameter.status is Status.ESTIMATED:
         return text
     return f"{text} ({parameter.status}: {parameter.reason})"
+
+
+def performance_texts(item: PerformanceDocument, texts: Texts) -> list[str]:
+    """A figure of performance in sentences: its value, against that of the healthy machine, and at a limit."""
+    if item.value is None or item.sd is None:
+        return [texts("no_figure", reason=texts.translated(item.reason))]
+    lines = [interval_text(item.value, item.sd, item.unit)]
+    if item.status is not Status.ESTIMATED:
+        lines[0] += f" ({texts.translated(item.status)}: {texts.translated(item.reason)})"
+    if item.baseline is not None:
+        is_same = abs(item.value - item.baseline) <= QUANTILE * item.sd
+        key = "as_healthy" if is_same else "more_than_healthy" if item.value > item.baseline else "less_than_healthy"
+        healthy = quantity_text(item.baseline, item.unit)
+        share = f"{abs(item.value / item.baseline - 1.0):.0%}".replace("%", " %") if item.baseline else ""
+        lines.append(texts(key, share=share, healthy=healthy).strip())
+    if item.at_limit is not None and item.limit is not None:
+        limit, value = quantity_text(item.limit, item.limit_unit or "1"), quantity_text(item.at_limit, item.unit)
+        lines.append(texts("figure_at_limit", name=item.limited, limit=limit, value=value))
+    return lines
 
 
 def component_text(component: ComponentDocument, texts: Texts) -> str:

@@ -35,7 +35,7 @@ from otolith.health.schema import (
 from otolith.health.text import Texts, texts_in, zone_of
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
-from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample, PartState
+from otolith.storage.history import DAY, HOUR, PERFORMANCE, RESOLUTIONS, HistoryReader, HistorySample, PartState
 from otolith_drivers.common.time_zones import comes_twice, local_moment
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
@@ -287,6 +287,8 @@ def _curves(
     components = {row.id: row for row in latest.components} if latest else {}
     rows: dict[str, list[HistorySample]] = {name: [] for name in parameters}
     for sample in samples:
+        if sample.name.startswith(PERFORMANCE):  # the page states their present values
+            continue
         rows.setdefault(sample.name, []).append(sample)
     for name, own in rows.items():
         parameter, component = parameters.get(name), components.get(name)

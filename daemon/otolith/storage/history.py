@@ -29,6 +29,7 @@ from otolith.health.schema import (
     NumberDocument,
     ParameterDocument,
     PartDocument,
+    PerformanceDocument,
     ReportDocument,
 )
 from otolith.storage.history_safety import QUERY_TIME, Unpacker, bound, moment, number, rows_of
@@ -44,6 +45,7 @@ log = logging.getLogger(__name__)
 
 SUFFIX = ".history.sqlite"
 KEPT = ".kept.sqlite"  # of one that was set aside
+PERFORMANCE = "performance."  # Before the name of a figure of performance, as the name of its values
 WINDOW, MINUTE, HOUR, DAY = 0, 60, 3600, 86_400
 RESOLUTIONS = {WINDOW: "window", MINUTE: "minute", HOUR: "hour", DAY: "day"}
 """Seconds of an interval, and its name; 0 for the windows themselves."""
@@ -213,6 +215,8 @@ class Tables:
         execute, end = self._connection.execute, document.window.end
         for name, parameter in document.parameters.items():
             self._add_value(name, end, parameter, parameter.status)
+        for name, figure in (document.performance or {}).items():
+            self._add_value(f"{PERFORMANCE}{name}", end, figure, figure.status)
         for component in document.components:
             self._add_value(component.id, end, component.values["amplitude"], component.status)
         if (health := document.health) is not None:
@@ -255,7 +259,9 @@ class Tables:
                 self._connection.execute(query, (since, part, before[2]))
                 self._states[part] = state, since, before[2]
 
-    def _add_value(self, name: str, end: float, item: ParameterDocument | NumberDocument, status: str) -> None:
+    def _add_value(
+        self, name: str, end: float, item: ParameterDocument | NumberDocument | PerformanceDocument, status: str
+    ) -> None:
         if item.value is None:
             return
         series, rest = self._number(name, item.unit), (item.value, item.low, item.high, status)

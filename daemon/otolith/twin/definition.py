@@ -96,6 +96,19 @@ class Site:
 
 
 @dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of performance: what the owner of the machine pays for or gets, as a loss or a speed that it reaches."""
+
+    name: str
+    unit: str
+    meaning: str
+    expression: str
+    better: Literal["lower", "higher"]
+    at: tuple[tuple[str, float], ...] = ()
+    """Values of inputs and states, the operating point; the others are those of the window, and the figure its mean."""
+
+
+@dataclass(frozen=True, slots=True)
 class Definition:
     """A twin: its quantities and equations."""
 
@@ -111,6 +124,7 @@ class Definition:
     constants: tuple[Constant, ...] = ()
     definitions: tuple[tuple[str, str, str], ...] = ()  # Name, expression and meaning, in the author's order
     sites: tuple[Site, ...] = ()
+    performance: tuple[Figure, ...] = ()
     base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.components)
 
     def __hash__(self) -> int:

@@ -8,12 +8,23 @@ import ast
 import math
 import re
 from collections.abc import Callable, Mapping, Sized
+from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
+from otolith.twin.definition import (
+    Constant,
+    Definition,
+    Figure,
+    Input,
+    Output,
+    Parameter,
+    Role,
+    Site,
+    StateVariable,
+)
 from otolith.twin.expressions import (
     Dimension,
     ExpressionError,
@@ -33,7 +44,7 @@ from otolith_drivers.units import Quantity, limit_values, to_base
 
 # Limits keep the compile time of a kernel in minutes; docs/reference/thresholds-twin.md.
 MAX_COEFFICIENT = -0.1, 0.1  # 1/K: lowest and highest temperature coefficient
-MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60}
+MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60, "performance": 12}
 MAX_EXPANDED_TERMS, MAX_EXPANDED_LEVELS = 3000, 100  # of an equation with its definitions substituted
 
 Fault = Callable[[Location, str], None]  # Records what is wrong at a place of the file
@@ -114,6 +125,14 @@ class _SiteTable(_QuantityTable):
     part: str = ""
 
 
+class FigureTable(_QuantityTable):
+    """A figure of performance, in a twin or in a machine file."""
+
+    expression: str
+    better: Literal["lower", "higher"]
+    at: Annotated[dict[str, Number], Field(default_factory=dict)]
+
+
 class _TwinFile(StrictModel):
     twin: _HeadTable
     states: dict[str, _StateTable]
@@ -124,6 +143,7 @@ class _TwinFile(StrictModel):
     definitions: Annotated[dict[str, str | _DefinitionTable], Field(default_factory=dict)]
     equations: dict[str, str]
     sites: Annotated[dict[str, _SiteTable], Field(default_factory=dict)]
+    performance: Annotated[dict[str, FigureTable], Field(default_factory=dict)]
 
 
 def read_twin(page: SourceFile) -> Definition:
@@ -135,12 +155,46 @@ def read_twin(page: SourceFile) -> Definition:
     def fault(location: Location, message: str) -> None:
         faults.append(f"{page.place(location)}: {message}")
 
-    definition = _Reader(validate(data, _TwinFile, page), fault).definition()
+    file = validate(data, _TwinFile, page)
+    definition = _Reader(file, fault).definition()
     if not faults:
-        _EquationChecker(definition, fault).check()
+        checker = _EquationChecker(definition, fault)
+        checker.check()
+        if not faults:
+            checker.check_performance()
     if faults:
         raise ConfigurationError("\n".join(dict.fromkeys(faults)))
     return definition
+
+
+def with_performance(definition: Definition, tables: Mapping[str, FigureTable], fault: Fault) -> Definition:
+    """Return the twin with other figures of performance, which replace those of the same name; reports each fault."""
+    for name in tables:
+        try:
+            check_name(name)
+        except ValueError as error:
+            fault(("performance", name), str(error))
+    own = {figure.name: figure for figure in definition.performance}
+    own |= {name: _figure(name, table, definition.units(), fault) for name, table in tables.items()}
+    complete = replace(definition, performance=tuple(own.values()))
+    checker = _EquationChecker(complete, fault)
+    checker.check()
+    checker.check_performance()
+    return complete
+
+
+def _figure(name: str, table: FigureTable, units: Mapping[str, str], fault: Fault) -> Figure:
+    """Return a figure with its operating point in the units of the twin; a name that is none is reported later."""
+    values = []
+    for signal, written in table.at.items():
+        value = math.nan if isinstance(written, str) else float(written)
+        if isinstance(written, str) and signal in units:
+            try:
+                value = Quantity(units[signal]).convert(written)
+            except ValueError as error:
+                fault(("performance", name, "at", signal), str(error))
+        values.append((signal, value))
+    return Figure(name, table.unit, table.meaning, table.expression, table.better, tuple(values))
 
 
 def equation_faults(definition: Definition) -> list[str]:
@@ -180,7 +234,13 @@ class _Reader:
                 Site(name, t.unit, t.meaning, t.into, t.mode, t.through, t.part or name)
                 for name, t in file.sites.items()
             ),
+            performance=tuple(
+                _figure(name, table, self._units(), self._fault) for name, table in file.performance.items()
+            ),
         )
+
+    def _units(self) -> dict[str, str]:
+        return {name: row.unit for group in (self._file.states, self._file.inputs) for name, row in group.items()}
 
     def _check_sizes(self) -> None:
         for table, limit in MAX_ROWS.items():
@@ -192,7 +252,8 @@ class _Reader:
 
     def _check_names(self) -> None:
         owner: dict[str, str] = {}
-        for table in ("states", "inputs", "outputs", "parameters", "constants", "definitions", "sites"):
+        for table in ("states", "inputs", "outputs", "parameters", "constants", "definitions", "sites",
+                      "performance"):  # fmt: skip
             for name in getattr(self._file, table):
                 try:
                     check_name(name)
@@ -290,6 +351,39 @@ class _EquationChecker:
             self._check_used(used)
             for site in self._definition.sites:
                 self._check_site(site)
+
+    def check_performance(self) -> None:
+        """Report the faults of the figures of performance; :meth:`check` comes first."""
+        shown = {output.name for output in self._definition.outputs}
+        hidden = [name for name in self._states if name not in shown]
+        driving = [*self._states, *(driven.name for driven in self._definition.inputs)]
+        for figure in self._definition.performance:
+            at: Location = ("performance", figure.name)
+            for name, _ in figure.at:
+                if name not in driving:
+                    self._fault(
+                        (*at, "at", name), f"{name!r} is neither an input nor a state: {nearest(name, driving)}"
+                    )
+            if (tree := self._tree((*at, "expression"), figure.expression)) is None:
+                continue
+            for name in sorted(self._used_by(names_in(tree)) & set(hidden) - {name for name, _ in figure.at}):
+                text = (
+                    f"no output shows the state {name!r}, so a window has no value of it: write at = {{ {name} = ... }}"
+                )
+                self._fault((*at, "expression"), text)
+            inferred = self._dimension((*at, "expression"), tree)
+            if inferred is not None and inferred != dimension_of(figure.unit):
+                text = f"the unit {figure.unit!r} is in {describe(dimension_of(figure.unit))}, the expression in"
+                self._fault((*at, "expression"), f"{text} {describe(inferred)}")
+
+    def _used_by(self, names: set[str]) -> set[str]:
+        """Return ``names``, and those that the definitions among them use, directly or through others."""
+        used, pending = set(names), list(names)
+        while pending:
+            inner = names_in(self._trees[name]) if (name := pending.pop()) in self._trees else set()
+            pending += inner - used
+            used |= inner
+        return used
 
     def _fault(self, location: Location, message: str) -> None:
         self._faulty = True
@@ -392,16 +486,16 @@ class _EquationChecker:
                 used |= names_in(parse(site.through))
             except ExpressionError:
                 continue  # the check of the site reports it
-        pending = list(used)
-        while pending:
-            inner = names_in(self._trees[name]) if (name := pending.pop()) in self._trees else set()
-            pending += inner - used
-            used |= inner
+        used, of_figures = self._used_by(used), set[str]()
+        for figure in self._definition.performance:
+            with suppress(ExpressionError):  # check_performance reports it
+                of_figures |= self._used_by(names_in(parse(figure.expression)))
+        fixed = {"constants": [fixed.name for fixed in self._definition.constants]}
+        fixed |= {"definitions": [name for name, _, _ in self._definition.definitions]}
         tables = {
             "parameters": [parameter.name for parameter in self._definition.parameters],
             "inputs": [driven.name for driven in self._definition.inputs],
-            "constants": [fixed.name for fixed in self._definition.constants],
-            "definitions": [name for name, _, _ in self._definition.definitions],
+            **{table: [name for name in rows if name not in of_figures] for table, rows in fixed.items()},
         }
         for table, rows in tables.items():
             for name in rows:

@@ -13,7 +13,18 @@ from otolith.twin.definition import Parameter, Role
 from otolith_drivers.config_files import SourceFile, parse
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 
-OF_THE_MACHINE = ("machine", "driver", "signals", "twin", "parameters", "components", "rule", "noise", "process_noise")
+OF_THE_MACHINE = (
+    "machine",
+    "driver",
+    "signals",
+    "twin",
+    "parameters",
+    "components",
+    "performance",
+    "rule",
+    "noise",
+    "process_noise",
+)
 Table = Mapping[str, Any]
 
 
@@ -27,8 +38,9 @@ def complete_lines(machine: LoadedMachine, source: SourceFile) -> Iterator[str]:
     for parameter in machine.twin.parameters:
         if parameter.role is not Role.SETTING:
             yield from _parameter(machine, parameter, data.get("parameters", {}).get(parameter.name, {}))
-    for name, table in data.get("components", {}).items():
-        yield from (_header(("components", name)), *_written(table), "")
+    for kind in ("components", "performance"):
+        for name, table in data.get(kind, {}).items():
+            yield from (_header((kind, name)), *_written(table), "")
     for rule in data.get("rule", ()):
         yield from ("[[rule]]", *_written(rule), "")
     yield from _noise(machine, data)
