@@ -256,6 +256,17 @@ def test_a_rest_explains_as_much_as_it_was_long_enough_for(rest: float, expected
     assert judged([(0.0, 6.5), (rest, cold)]) == [Level.OK, expected]
 
 
+@pytest.mark.parametrize("away", [-3600.0, 60.0, 36_000.0])
+def test_no_rest_explains_what_was_a_finding_before_it(away: float) -> None:
+    """A motor whose turns have shorted out is switched off, also by a computer whose clock is wrong afterwards."""
+    healthy, shorted = [(2.0 * at, 6.5) for at in range(20)], [(40.0 + 2.0 * at, 5.9) for at in range(20)]
+    after = [(78.0 + away + 2.0 * at, 5.9) for at in range(20)]
+    repaired = [(118.0 + away + 2.0 * at, 6.49) for at in range(5)]
+    levels = judged(healthy + shorted + after + repaired)
+    assert set(levels[20:60]) == {Level.ACT}
+    assert set(levels[60:]) == {Level.OK}
+
+
 def test_a_limit_that_is_passed_in_the_cold_says_so() -> None:
     """The motor has started 10 K colder; then turns short out."""
     cold = 6.5 * (1.0 - 10.0 * COPPER)

@@ -113,7 +113,7 @@ def bundles_about(part: str) -> list[Path]:
 @pytest.mark.full
 def test_the_evidence_of_a_killed_daemon_is_reproduced_by_another_process(start: Start, healthy: OwnMachine) -> None:
     text = healthy.machine.read_text(encoding="utf-8")
-    healthy.machine.write_text(text.replace('R_a = { value = "6.5 ohm"', 'R_a = { value = "7.2 ohm"'), encoding="utf-8")
+    healthy.machine.write_text(text.replace('R_a = { value = "6.5 ohm"', 'R_a = { value = "3.8 ohm"'), encoding="utf-8")
     running = start()
     wait_for(lambda: bool(bundles_about("winding")) or running.daemon.poll() is not None, 3 * PATIENCE)
     running.stop(signal.SIGKILL)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.adaptation.frozen_sensors import frozen_readings, with_still_frozen
 from otolith.adaptation.operating_states import running_part
 from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
@@ -98,6 +99,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
         document = document.model_copy(update={"window": window_document(window)})
     health, document = assess(state.plan, state.health, document)
     ledger = _kept(ledger, result.decision, state.ledger)
+    if state.frozen or faulty:  # without samples it is as before
+        state = replace(state, frozen=state.frozen if checked.bad else frozen_readings(faulty, used))
     return _next_state(state, result, ledger, previous, health), replace(report, document=document)
 
 
@@ -125,6 +128,8 @@ def _predict_and_check(state: AdaptationState, window: Window) -> tuple[Adaptati
         window = with_changes_between(window, problem.changing)
     predicted = posterior.with_steps(window).predict(window)
     checked = check_window(window, predicted)
+    if state.frozen:
+        checked = with_still_frozen(checked, state.frozen, window)
     if predicted.problem is problem:
         return state, predicted, checked
     if not checked.is_usable:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from otolith.adaptation.fingerprints import fingerprint_of
+from otolith.adaptation.frozen_sensors import FrozenReading
 from otolith.commissioning.input_noise import InputNoiseSums
 from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
@@ -64,6 +65,7 @@ class AdaptationState:
     resets: Mapping[str, float] = field(default_factory=dict)  # The OperatorDecisions.resets that have been applied
     baselines: Mapping[str, Baseline] = field(default_factory=dict)
     """The OperatorDecisions.baselines that limits refer to."""
+    frozen: Mapping[str, FrozenReading] = field(default_factory=dict)  # Sensors that keep one value
 
     @property
     def is_valid(self) -> bool:

@@ -145,6 +145,7 @@ class Coldness:
 
     kelvin: float  # Below the temperature of the nominal value
     time: float  # Of the window that showed it, s
+    is_beyond: bool = False  # Whether it is beyond a limit all the same
 
 
 def coldness_after(
@@ -153,19 +154,21 @@ def coldness_after(
     """Return what a lower temperature explains of an estimate, after what it explained ``before``.
 
     ``window`` has begin and end of the window that it is of, s. At the start it explains all that the range of the
-    temperature allows. A machine that runs becomes colder only with its surroundings; one that rested, or of which
-    nothing was known, as fast as its time constant lets it. What is beyond a limit all the same is no matter of the
-    temperature, and stays so.
+    temperature allows. A machine that runs becomes colder only with its surroundings; one that rested, or whose clock
+    was set back, as fast as its time constant lets it. What is beyond a limit all the same is no matter of the
+    temperature, and stays so: no rest explains what was there before it.
     """
     start, time = window
     kelvin = min(max(quantity.colder_by(value), 0.0), quantity.coldest)
-    if before is not None and time >= before.time:
-        rest = max(start - before.time, 0.0)
-        reach = quantity.coldest * -math.expm1(-rest / quantity.thermal_time) + COOLING * (time - before.time)
-        allowed = min(kelvin, before.kelvin + reach)
-        level, _ = quantity.level(*quantity.warmed(value, sd, allowed), Level.OK)
-        kelvin = allowed if level is Level.OK else min(kelvin, before.kelvin)
-    return Coldness(kelvin, time)
+    if before is None:
+        level, _ = quantity.level(*quantity.warmed(value, sd, kelvin), Level.OK)
+        return Coldness(kelvin, time, level is not Level.OK)
+    rest = max(start - before.time, 0.0) if time >= before.time else math.inf
+    reach = quantity.coldest * -math.expm1(-rest / quantity.thermal_time) + COOLING * max(time - before.time, 0.0)
+    allowed = min(kelvin, before.kelvin + (0.0 if before.is_beyond else reach))
+    level, _ = quantity.level(*quantity.warmed(value, sd, allowed), Level.OK)
+    is_beyond = level is not Level.OK
+    return Coldness(min(kelvin, before.kelvin) if is_beyond else allowed, time, is_beyond)
 
 
 def probability_beyond(limit: Limit, value: float, sd: float) -> float:
