@@ -97,7 +97,10 @@ def _figure(
         return FigureValue(figure, own, is_mean=bool(driving), reason="it has no finite value here")
     steps = np.array([rows[1 + 2 * k][name] - rows[2 + 2 * k][name] for k, name in enumerate(own)])
     slopes = (means[1 : 1 + 2 * len(own) : 2] - means[2 : 2 + 2 * len(own) : 2]) / steps
-    variance = float(slopes @ estimates.covariance[np.ix_(free, free)] @ slopes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        variance = float(slopes @ estimates.covariance[np.ix_(free, free)] @ slopes)
+    if not np.isfinite(variance):
+        return FigureValue(figure, own, is_mean=bool(driving), reason="it has no finite interval here")
     compared = [(float(value), *case) for value, case in zip(means[1 + 2 * len(own) :], cases, strict=True)]
     healthy = next((value for value, name, _ in compared if not name and np.isfinite(value)), None)
     sign = 1.0 if figure.better == "lower" else -1.0
