@@ -33,12 +33,12 @@ def with_still_frozen(checked: CheckedWindow, frozen: Mapping[str, FrozenReading
 
 def frozen_readings(faulty: tuple[FaultySensor, ...], window: Window) -> dict[str, FrozenReading]:
     """Return the sensors that are ``faulty`` in ``window`` and keep one value in all of it."""
-    found = {}
+    readings = {}
     for sensor in faulty:
         samples = _samples(window, sensor.signal)
         if len(samples) and np.ptp(samples) == 0.0:
-            found[sensor.signal] = FrozenReading(sensor, float(samples[0]))
-    return found
+            readings[sensor.signal] = FrozenReading(sensor, float(samples[0]))
+    return readings
 
 
 def _samples(window: Window, name: str) -> Array:

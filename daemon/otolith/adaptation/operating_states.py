@@ -5,7 +5,6 @@ of the twin do not hold there, so that such a stretch is evidence of nothing. It
 volts, in whose equation the current is zero within its noise, in a window that contradicts the twin.
 """
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Mask, Window
 from otolith.estimation.problem import Problem
+from otolith.twin.expressions import names_in, parse
 from otolith_drivers.units import are_of_one_quantity
 
 MIN_OFF = 5  # records without a command from which on a drive is off
@@ -73,8 +73,8 @@ def _driven_currents(problem: Problem) -> Iterator[tuple[str, list[str]]]:
     equations = dict(twin.equations)
     volts = [row.name for row in twin.inputs if are_of_one_quantity(row.unit, "V")]
     for output in twin.outputs:
-        words = set(re.findall(r"\w+", equations.get(f"der({output.name})", "")))
-        commands = [name for name in volts if name in words]
+        rate = equations.get(f"der({output.name})")
+        commands = [name for name in volts if rate and name in names_in(parse(rate))]
         if commands and are_of_one_quantity(output.unit, "A"):
             yield output.name, commands
 
