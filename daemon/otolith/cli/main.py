@@ -46,6 +46,7 @@ from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
 from otolith.cli.operation.simulate import simulate
 from otolith.cli.operation.view import view
+from otolith.cli.site import site
 from otolith.cli.terminal import echo
 
 if TYPE_CHECKING:
@@ -387,6 +388,7 @@ COMMANDS: tuple[click.Command, ...] = (
     reproduce,
     reset,
     simulate,
+    site,
     twin,
     view,
 )

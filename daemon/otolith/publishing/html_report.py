@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
@@ -23,6 +23,7 @@ from otolith.acquisition.quality import is_of_calendar
 from otolith.estimation.information import QUANTILE
 from otolith.health import text
 from otolith.health.conditions import ConditionPage, pages_of
+from otolith.health.diagnosis import Rule
 from otolith.health.limits import Level
 from otolith.health.schema import (
     ComponentDocument,
@@ -35,7 +36,7 @@ from otolith.health.schema import (
 from otolith.health.text import Texts, texts_in, zone_of
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
-from otolith.storage.history import DAY, HOUR, PERFORMANCE, RESOLUTIONS, HistoryReader, HistorySample, PartState
+from otolith.storage.history import DAY, HOUR, PERFORMANCE, RESOLUTIONS, HistorySample, PartState
 from otolith_drivers.common.time_zones import comes_twice, local_moment
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import Scale, equation_text, formula_text, quantity_text, scale_of
@@ -126,9 +127,35 @@ class Curve:
     ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""
 
 
-def html_report(
-    reader: HistoryReader, samples: Iterable[HistorySample], interval: str, since: float, now: float
-) -> str:
+class PageSource(Protocol):
+    """What a page reads: a :class:`HistoryReader`, or reports that were received."""
+
+    site: str
+    machine: str
+
+    def latest(self, count: int) -> list[ReportDocument]:
+        """Return the last reports, the newest first."""
+
+    def states(self, since: float) -> list[PartState]:
+        """Return the states of the parts in the order in which they were entered."""
+
+    def events(self, since: float) -> list[EventDocument]:
+        """Return the changes of events since a time, in their order."""
+
+    def findings(self, since: float) -> list[dict[str, Any]]:
+        """Return the findings since a time."""
+
+    def counters(self, since: float) -> list[dict[str, Any]]:
+        """Return the last counters of each hour and start of the daemon since a time."""
+
+    def description(self) -> dict[str, Any]:
+        """Return what reports do not repeat; empty if it is not known."""
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return the rules of the machine file."""
+
+
+def html_report(reader: PageSource, samples: Iterable[HistorySample], interval: str, since: float, now: float) -> str:
     """Return the page about the time from ``since`` to ``now``, from ``samples`` of each ``interval``.
 
     If nobody continues the history, ``now`` is the end of its last window.
@@ -186,7 +213,7 @@ def html_report(
 
 
 def _conditions(
-    reader: HistoryReader, told: Iterable[tuple[EventDocument, Level, object]], texts: Texts
+    reader: PageSource, told: Iterable[tuple[EventDocument, Level, object]], texts: Texts
 ) -> list[ConditionPage]:
     """Return what the conditions of events mean, by the rules of the machine."""
     rules = (*reader.own_rules(), *load_rules(texts.language))
@@ -229,7 +256,7 @@ def _gaps(times: Sequence[float], length: float) -> list[Span]:
 
 
 def _events(
-    reader: HistoryReader, latest: ReportDocument | None, since: float
+    reader: PageSource, latest: ReportDocument | None, since: float
 ) -> list[tuple[EventDocument, Level, list[tuple[float, Level]]]]:
     """Return events, their most severe states and all states with their begin: the open ones first, then the newest."""
     rows = {event.id: event for event in (*reader.events(since), *(latest.events if latest else ()))}

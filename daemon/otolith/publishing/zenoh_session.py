@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import zenoh
 
@@ -25,7 +25,6 @@ from otolith.publishing.zenoh_config import (
     Settings,
     raise_descriptor_limit,
 )
-from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import ServiceError
 
@@ -84,7 +83,16 @@ def _instant(text: str, now: float) -> float | None:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: HistoryWriter | None) -> None:
+class Archive(Protocol):
+    """What answers queries for the past: :class:`otolith.storage.history_writer.HistoryWriter`."""
+
+    def messages(
+        self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
+    ) -> list[str]:
+        """Return the first ``limit`` documents of a kind with a number above ``after`` from ``start`` to ``end``."""
+
+
+def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: Archive | None) -> None:
     """Reply with the selected documents of a ``kind``, oldest first; with the ``latest`` if nothing is selected."""
     try:
         selected = selection(query.parameters, time.time())

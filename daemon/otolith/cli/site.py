@@ -1,0 +1,43 @@
+"""``otolith site``: one page for all machines, and what is known of them for other systems."""
+
+import importlib.util
+import signal
+from pathlib import Path
+
+import click
+
+from otolith.cli.common import FILE, INTERRUPTED, log_to_stderr
+from otolith.cli.terminal import echo
+
+EXTRA = ("prometheus_client", "starlette", "uvicorn")
+
+
+@click.command()
+@click.argument("file", type=FILE, required=False, metavar="[SITE.TOML]")
+@click.option("-v", "--verbose", is_flag=True, help="Log more.")
+def site(file: Path | None, verbose: bool) -> int:
+    """Serve one page for all machines, in the foreground.
+
+    It reads what daemons publish over Zenoh, and nothing else: no bus and no
+    state directory. Without SITE.TOML it shows the daemons of this computer on
+    http://127.0.0.1:8420/. It runs until SIGTERM or Ctrl-C.
+
+    \b
+    Examples:
+      otolith site
+      otolith site site.toml
+    """
+    from otolith_drivers.errors import ServiceError, installation_of
+
+    if lacking := [name for name in EXTRA if importlib.util.find_spec(name) is None]:
+        raise ServiceError(f"{', '.join(lacking)} is missing: {installation_of('site')}")
+    from otolith.site.collector import Collector
+    from otolith.site.server import run_site
+    from otolith.site.settings import SiteFile, load_site
+
+    log_to_stderr(verbose=verbose)
+    settings = SiteFile() if file is None else load_site(file)
+    folder = Path() if file is None else file.parent.absolute()
+    collector = Collector(settings.connection(folder))
+    ended_by = run_site(collector, settings, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
+    return INTERRUPTED if ended_by == signal.SIGINT else 0

@@ -1,0 +1,105 @@
+"""The same parameter in machines of the same twin, and the events of the last week."""
+
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from otolith.health.limits import Level
+from otolith.health.schema import Language, ParameterDocument
+from otolith.health.text import texts_in, value_text
+from otolith.health.times import moment_text
+from otolith.site.cards import in_language
+from otolith.site.known import Knowledge, KnownMachine, share_of
+from otolith_drivers.outside_text import visible
+from otolith_drivers.units import quantity_text
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+MIN_SISTERS = 4  # machines of a twin, from which one can differ from the others
+OUTLIER = 3.5  # distance to the median over the normal-consistent median absolute deviation
+CONSISTENT = 0.6745  # median absolute deviation of a normal distribution of standard deviation 1
+MAX_ROWS = 200  # events, and machines of a table
+WEEK = 604_800.0  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Sister:
+    """A parameter of a machine beside that of its sisters."""
+
+    machine: KnownMachine
+    value: str
+    healthy: str
+    limit: str
+    state: str
+    is_outlier: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TimedEvent:
+    """An event, in words."""
+
+    machine: KnownMachine
+    time: str
+    part: str
+    condition: str
+    state: str
+
+
+def sisters(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[str, str], list[Sister]]:
+    """Return the machines of each twin and parameter with a limit, the nearest to its limit first."""
+    groups: dict[tuple[str, str], list[tuple[KnownMachine, ParameterDocument, float]]] = {}
+    for machine in knowledge:
+        for name, row in machine.report.parameters.items() if machine.report else ():
+            if (share := share_of(row)) is not None:
+                groups.setdefault((machine.report.twin if machine.report else "", name), []).append(
+                    (machine, row, share)
+                )
+    say, found = texts_in(language), {}
+    for key, rows in sorted(groups.items()):
+        if len(rows) < 2:
+            continue
+        rows.sort(key=lambda row: -row[2])
+        away = _outliers([share for *_, share in rows])
+        found[key] = [
+            Sister(
+                machine, visible(say.decimals(say.translated(value_text(row)))),
+                say.decimals(quantity_text(row.nominal if row.baseline is None else row.baseline, row.unit)),
+                "" if row.limit is None else say.decimals(quantity_text(row.limit, row.unit)),
+                say.translated(machine.state(now)), is_outlier,
+            )
+            for (machine, row, _), is_outlier in list(zip(rows, away, strict=True))[:MAX_ROWS]
+        ]  # fmt: skip
+    return found
+
+
+def _outliers(shares: list[float]) -> list[bool]:
+    """Return which values differ from the others, by the modified z-score of Iglewicz and Hoaglin (1993)."""
+    if len(shares) < MIN_SISTERS:
+        return [False] * len(shares)
+    middle = statistics.median(shares)
+    spread = statistics.median(abs(share - middle) for share in shares)
+    return [CONSISTENT * abs(share - middle) > OUTLIER * max(spread, 1e-3) for share in shares]
+
+
+def week(knowledge: Knowledge, now: float, language: Language, zone: str | None) -> list[TimedEvent]:
+    """Return the events that were open in the last week, the newest first; without hints."""
+    found = sorted(_recent(knowledge, now), key=lambda row: -row[0])
+    return [event for _, event in _worded(found[:MAX_ROWS], language, zone)]
+
+
+def _recent(knowledge: Knowledge, now: float) -> Iterator[tuple[float, KnownMachine, str]]:
+    for machine in knowledge:
+        for key, event in machine.events.items():
+            if not event.is_hint and (event.end is None or event.end > now - WEEK):
+                yield event.start, machine, key
+
+
+def _worded(
+    rows: list[tuple[float, KnownMachine, str]], language: Language, zone: str | None
+) -> Iterator[tuple[float, TimedEvent]]:
+    say = texts_in(language)
+    for start, machine, key in rows:
+        event = machine.events[key]
+        condition, _ = in_language(event, language)
+        state = event.state if event.end is None else Level.OK
+        time = moment_text(start, zone or event.timezone)
+        yield start, TimedEvent(machine, time, visible(say.part(event.part)), visible(condition), say.translated(state))

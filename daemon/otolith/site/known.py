@@ -1,0 +1,245 @@
+"""What is known of each machine of a site, from the documents that its daemons publish.
+
+It has no clock: each call says what time it is, in Unix s of the computer of the site. Anybody may publish anything to
+a router, so a document counts only if it can be read, is not too large, and is of the machine that its key names.
+"""
+
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from otolith.health.limits import Level
+from otolith.health.schema import EventDocument, ParameterDocument, ReportDocument
+from otolith.machine_file import check_name
+from otolith.publishing.zenoh_session import ALIVE, EVENT, REPORT
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+MAX_MACHINES = 400
+MAX_BYTES = 256 << 10  # of a document
+MAX_TOTAL_BYTES = 32 << 20  # of all latest reports
+MAX_EVENTS = 50  # of a machine: the last ones
+MAX_TRENDS = 16  # parameters of a machine of which a curve is kept
+MAX_POINTS = 48  # of a curve
+MAX_PAUSE = 1800.0  # s between two points of a curve
+SILENT_WINDOWS = 3.0  # lengths of a window without a report, and ...
+SILENT_SLACK = 5.0  # ... s beside them, until nothing is known of a machine
+RENUMBERED_AFTER = 30.0  # s without a report after which a lower number counts
+
+
+class Refusal(StrEnum):
+    """Why a document was not taken."""
+
+    TOO_LARGE = "too_large"
+    UNREADABLE = "unreadable"  # No document of a version that is known here
+    OTHER_NAME = "other_name"  # Of another machine than its key
+    NUMBER = "number"  # A report with a lower number than the last one, which has just come: two publish it
+    TOO_MANY = "too_many"  # More machines, or larger reports, than there is room for
+
+
+@dataclass(slots=True)
+class Trend:
+    """The values of a parameter: at first each, later fewer, so that they cover up to a day."""
+
+    times: "array[float]" = field(default_factory=lambda: array("d"))
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+    pause: float = 0.0  # s between two of them, at least
+
+    def add(self, time: float, value: float) -> None:
+        """Append a value; drop one of two as soon as there are too many, or the oldest if they cover enough."""
+        if self.times and not self.pause <= time - self.times[-1]:
+            return
+        self.times.append(time)
+        self.values.append(value)
+        if len(self.times) <= MAX_POINTS:
+            return
+        if self.pause >= MAX_PAUSE:
+            del self.times[0], self.values[0]
+            return
+        self.pause = min(2.0 * max(self.pause, self.times[-1] - self.times[-2]), MAX_PAUSE)
+        self.times, self.values = self.times[::2], self.values[::2]
+
+
+@dataclass(slots=True)
+class KnownMachine:
+    """A machine, its latest report, and its last events."""
+
+    site: str
+    name: str
+    report: ReportDocument | None = None
+    heard: float = 0.0  # When its last report came
+    is_alive: bool = True  # Whether its daemon runs
+    events: dict[str, EventDocument] = field(default_factory=dict)  # By id; the last change of each
+    trends: dict[str, Trend] = field(default_factory=dict)  # Of parameters that have a limit
+    revision: int = 0  # Rises with each document
+    size: int = 0  # Bytes of its report
+
+    def is_silent(self, now: float) -> bool:
+        """Whether nothing is known at present."""
+        if self.report is None or not self.is_alive:
+            return True
+        window = self.report.window
+        return now - self.heard > SILENT_WINDOWS * (window.end - window.start) + SILENT_SLACK
+
+    def state(self, now: float) -> Level:
+        """Return its state: that of its report, or NO DATA."""
+        if self.report is None or self.report.health is None or self.is_silent(now):
+            return Level.NO_DATA
+        return self.report.health.state
+
+    @property
+    def nearest(self) -> tuple[str, float] | None:
+        """The parameter nearest to its limit, and its share of the way from its healthy value to it."""
+        if self.report is None:
+            return None
+        shares = {name: share for name, row in self.report.parameters.items() if (share := share_of(row)) is not None}
+        name = max(shares, key=lambda name: shares[name], default=None)
+        return None if name is None else (name, shares[name])
+
+
+def share_of(parameter: ParameterDocument) -> float | None:
+    """Return how far a value has come from its healthy value to its limit: 1 at it; None if it has none."""
+    value = parameter.value if parameter.referred is None else parameter.referred
+    healthy = parameter.nominal if parameter.baseline is None else parameter.baseline
+    if value is None or parameter.limit is None or parameter.limit == healthy:
+        return None
+    return (value - healthy) / (parameter.limit - healthy)
+
+
+class Knowledge:
+    """All machines. It is of one thread at a time."""
+
+    def __init__(self) -> None:
+        self._machines: dict[str, KnownMachine] = {}
+        self._bytes = 0
+        self.refused: Counter[Refusal] = Counter()
+        self.taken = 0  # Documents
+
+    def __iter__(self) -> Iterator[KnownMachine]:
+        return iter(self._machines.values())
+
+    def __len__(self) -> int:
+        return len(self._machines)
+
+    def get(self, site: str, name: str) -> KnownMachine | None:
+        """Return a machine, None if it is not known."""
+        return self._machines.get(f"{site}/{name}")
+
+    def worst_first(self, now: float) -> list[KnownMachine]:
+        """Return the machines, the most severe states first, then those that are in it for longest."""
+
+        def order(machine: KnownMachine) -> tuple[int, float, str, str]:
+            health = machine.report.health if machine.report else None
+            return -machine.state(now).rank, health.since if health else 0.0, machine.site, machine.name
+
+        return sorted(self, key=order)
+
+    def take(self, key: str, content: bytes, now: float, *, is_past: bool = False) -> bool:
+        """Take a document that came under a key; ``is_past`` of an answer, which may have been published long before.
+
+        Return whether it was taken, or had been before.
+        """
+        if (identity := _identity(key)) is None:
+            return False
+        site, name, topic = identity
+        refusal = Refusal.TOO_LARGE if len(content) > MAX_BYTES else None
+        if refusal is None:
+            try:
+                if topic == REPORT.key:
+                    refusal = self._take_report(site, name, content, now, is_past=is_past)
+                else:
+                    refusal = self._take_event(site, name, content)
+            except ValueError:  # ValidationError and UnicodeDecodeError are ValueErrors
+                refusal = Refusal.UNREADABLE
+        if refusal is not None:
+            self.refused[refusal] += 1
+            return False
+        self.taken += 1
+        return True
+
+    def take_alive(self, key: str, *, is_alive: bool) -> None:
+        """Take that a daemon runs, or does not any more."""
+        if (identity := _identity(key)) is None or identity[2] != ALIVE.key:
+            return
+        machine = self._machine(*identity[:2]) if is_alive else self.get(*identity[:2])
+        if machine is None:
+            self.refused[Refusal.TOO_MANY] += is_alive
+        elif machine.is_alive is not is_alive:
+            machine.is_alive = is_alive
+            machine.revision += 1
+
+    def _machine(self, site: str, name: str) -> KnownMachine | None:
+        """Return a machine, a new one if there is room."""
+        known = self.get(site, name)
+        if known is None and len(self._machines) < MAX_MACHINES:
+            known = self._machines[f"{site}/{name}"] = KnownMachine(site, name)
+        return known
+
+    def _take_report(self, site: str, name: str, content: bytes, now: float, *, is_past: bool) -> Refusal | None:
+        text = content.decode().replace('"schema"', '"schema_"', 1)
+        report = ReportDocument.model_validate_json(text, extra="ignore")  # a later version may write more
+        if (report.site, report.machine) != (site, name):
+            return Refusal.OTHER_NAME
+        known, heard = self.get(site, name), min(now, report.window.end) if is_past else now
+        if known is not None and (step := _step(known, report)) is not None and now - known.heard < RENUMBERED_AFTER:
+            if step == 0 or (step < 0 and is_past):
+                return None
+            if step < 0:
+                return Refusal.NUMBER
+        total = self._bytes + len(content) - (known.size if known else 0)
+        machine = self._machine(site, name) if total <= MAX_TOTAL_BYTES else None
+        if machine is None:
+            return Refusal.TOO_MANY
+        self._bytes, machine.size = total, len(content)
+        machine.report, machine.heard, machine.is_alive = report, heard, True
+        machine.revision += 1
+        for event in report.events:
+            _keep(machine, event)
+        _follow(machine, report)
+        return None
+
+    def _take_event(self, site: str, name: str, content: bytes) -> Refusal | None:
+        event = EventDocument.model_validate_json(content, extra="ignore")
+        machine = self._machine(site, name)
+        if machine is None:
+            return Refusal.TOO_MANY
+        _keep(machine, event)
+        machine.revision += 1
+        return None
+
+
+def _step(known: KnownMachine, report: ReportDocument) -> int | None:
+    """Return by how much the number of a report is higher than the last one; None without numbers."""
+    before = known.report.sequence if known.report else None
+    return None if before is None or report.sequence is None else report.sequence - before
+
+
+def _follow(machine: KnownMachine, report: ReportDocument) -> None:
+    """Append the values of a report to the curves."""
+    for name, row in report.parameters.items():
+        value = row.value if row.referred is None else row.referred
+        has_room = name in machine.trends or len(machine.trends) < MAX_TRENDS
+        if row.limit is not None and value is not None and has_room:
+            machine.trends.setdefault(name, Trend()).add(report.window.end, value)
+
+
+def _keep(machine: KnownMachine, event: EventDocument) -> None:
+    """Keep an event, unless a later change of it is known; of too many, drop the oldest."""
+    known = machine.events.get(event.id)
+    if known and known.sequence is not None and event.sequence is not None and event.sequence < known.sequence:
+        return
+    machine.events[event.id] = event
+    while len(machine.events) > MAX_EVENTS:
+        del machine.events[min(machine.events, key=lambda key: machine.events[key].start)]
+
+
+def _identity(key: str) -> tuple[str, str, str] | None:
+    """Return site, machine and topic of a key; None for one that no daemon has."""
+    parts = key.split("/")
+    if len(parts) != 4 or parts[0] != "otolith" or parts[3] not in {REPORT.key, EVENT.key, ALIVE.key}:
+        return None
+    try:
+        return check_name(parts[1]), check_name(parts[2]), parts[3]
+    except ValueError:
+        return None

@@ -1,0 +1,81 @@
+"""The past of a machine, from the history of its daemon over Zenoh: few reports, spread over the time asked for."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from otolith.health.schema import EventDocument, ReportDocument
+from otolith.publishing.received_history import ReceivedHistory
+from otolith.publishing.zenoh_session import EVENT, REPORT
+from otolith.site.known import MAX_BYTES
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+POINTS = 96  # reports of a page, at most
+MAX_EVENTS = 500  # of a page
+PARALLEL = 6  # queries of one page at a time
+SPANS = {"1h": 3600.0, "8h": 28_800.0, "24h": 86_400.0, "7d": 604_800.0}  # s, by the name that an address gives
+MIN_WINDOW = 2.0  # s: the shortest span of one query
+
+Ask = Callable[[str, int], list[bytes]]
+
+
+@dataclass(frozen=True, slots=True)
+class PastQuery:
+    """Which time of which machine is asked for."""
+
+    site: str
+    machine: str
+    since: float
+    until: float
+    window: float  # Length of a window, s
+
+
+def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> ReceivedHistory:
+    """Return the history of a machine; ``ask`` returns what daemons answer to a selector, with a limit."""
+    pieces = tuple(_pieces(query))
+    key = REPORT.under(query.site, query.machine)
+    selectors = [f"{key}?_time=[{_moment(begin)}..{_moment(end)}]" for begin, end in pieces]
+    with ThreadPoolExecutor(PARALLEL) as pool:
+        answers = pool.map(lambda selector: ask(selector, 1), selectors)
+        reports = {report.window.end: report for content in answers for report in _reports(content, query)}
+    if latest is not None and query.since <= latest.window.end <= query.until:
+        reports[latest.window.end] = latest
+    whole = f"{EVENT.under(query.site, query.machine)}?_time=[{_moment(query.since)}..{_moment(query.until)}]"
+    events = list(_events(ask(whole, MAX_EVENTS)))
+    return ReceivedHistory(query.site, query.machine, [reports[end] for end in sorted(reports)], events)
+
+
+def _pieces(query: PastQuery) -> Iterator[tuple[float, float]]:
+    """Yield the spans that are asked for, one report of each."""
+    length = max(query.window, MIN_WINDOW)
+    count = min(POINTS, max(int((query.until - query.since) / length), 1))
+    step = (query.until - query.since) / count
+    for index in range(count):
+        begin = query.since + index * step
+        yield begin, begin + min(1.5 * length, step)
+
+
+def _moment(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S.%f}Z"
+
+
+def _reports(contents: Sequence[bytes], query: PastQuery) -> Iterator[ReportDocument]:
+    for content in contents:
+        if len(content) <= MAX_BYTES:
+            try:
+                text = content.decode().replace('"schema"', '"schema_"', 1)
+                report = ReportDocument.model_validate_json(text, extra="ignore")
+            except ValueError:  # anybody may answer anything
+                continue
+            if (report.site, report.machine) == (query.site, query.machine):
+                yield report
+
+
+def _events(contents: Sequence[bytes]) -> Iterator[EventDocument]:
+    for content in contents:
+        if len(content) <= MAX_BYTES:
+            try:
+                yield EventDocument.model_validate_json(content, extra="ignore")
+            except ValueError:  # as above
+                continue

@@ -1,0 +1,81 @@
+"""The file of a site: where its daemons are, where browsers reach it, and by which names."""
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, model_validator
+
+from otolith.health.schema import Language
+from otolith.machine_file import Endpoint
+from otolith.publishing.zenoh_config import Connection, Credentials
+from otolith_drivers.config_files import StrictModel, parse, read, validate
+
+OWN_HOSTS = ("localhost", "127.0.0.1", "::1")
+
+
+def _address(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no address with a port."""
+    host, _, port = text.rpartition(":")
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+        is_port = port.isdecimal() and 0 < int(port) < 65_536
+    except ValueError:
+        is_port = False
+    if not is_port:
+        raise ValueError(f'{text!r} is no address with a port: write it like "127.0.0.1:8420" or "[::1]:8420"')
+    return text
+
+
+class HttpTable(StrictModel):
+    """Where browsers reach the site."""
+
+    listen: Annotated[str, AfterValidator(_address)] = "127.0.0.1:8420"
+    hosts: tuple[str, ...] = ()  # Names by which browsers reach it, beside those of this computer for itself
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port to listen on."""
+        host, _, port = self.listen.rpartition(":")
+        return host.strip("[]"), int(port)
+
+    @model_validator(mode="after")
+    def _has_names_where_others_reach_it(self) -> "HttpTable":
+        if not ipaddress.ip_address(self.address[0]).is_loopback and not self.hosts:
+            names = 'write hosts = ["site.plant.local"], the names by which browsers reach it'
+            raise ValueError(f"listen = {self.listen!r} is for other computers: {names}")
+        return self
+
+
+class ReadersTable(StrictModel):
+    """Where the daemons publish, and the files by which they recognise the site."""
+
+    connect: tuple[Endpoint, ...] = ()  # Empty for the daemons of this computer
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    login: Path | None = None  # A file with one line name:password
+
+
+class SiteFile(StrictModel):
+    """The whole file."""
+
+    title: str = "Otolith"
+    language: Language | None = None  # By default that of the browser
+    timezone: str | None = None  # By default that of each machine
+    http: HttpTable = HttpTable()
+    zenoh: ReadersTable = ReadersTable()
+
+    def connection(self, folder: Path) -> Connection:
+        """Return how the site reads daemons; files are named relative to ``folder``."""
+        ca, certificate, key, login = (
+            None if path is None else folder / path
+            for path in (self.zenoh.ca, self.zenoh.certificate, self.zenoh.key, self.zenoh.login)
+        )
+        return Connection(self.zenoh.connect, Credentials(ca, certificate, key, login))
+
+
+def load_site(path: Path) -> SiteFile:
+    """Return the site of a file; raise ConfigurationError with a line per fault."""
+    file = read(path)
+    return validate(parse(file), SiteFile, file)
