@@ -40,14 +40,14 @@ class Browser:
         for domain in ("Page", "Network", "Runtime", "Log"):
             self._call(f"{domain}.enable")
 
-    def open(self, path: Path, width: int, height: int, *, is_phone: bool = False, is_dark: bool = False) -> None:
-        """Open a file in a window of that size in pixels, as a person who prefers dark pages sees it or another one."""
+    def open(self, page: Path | str, width: int, height: int, *, is_phone: bool = False, is_dark: bool = False) -> None:
+        """Open a file or an address in a window of that size in pixels, as who prefers dark pages sees it or not."""
         scheme = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[scheme])
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
                    mobile=is_phone)  # fmt: skip
         self.events.clear()
-        self._call("Page.navigate", url=path.absolute().as_uri())
+        self._call("Page.navigate", url=page if isinstance(page, str) else page.absolute().as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self._receive()
 

@@ -24,6 +24,7 @@ BREACHES = {
     "estimation opens a file": ("daemon/otolith/estimation/minimisers.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
     "the twin imports the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
+    "the site reads a state directory": ("daemon/otolith/site/hall.py", "import otolith.storage.state_store"),
     "acquisition imports publishing": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),
 }
 

@@ -29,6 +29,7 @@ SOURCES = {
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
     "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],
+    "site": [DAEMON / "site"],
     "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin"],

@@ -235,9 +235,17 @@ def test_queries_select_by_time_and_number(tmp_path: Path) -> None:
         assert len(asked(f"{key}?_time=[{begin}..{end}]".replace("+00:00", "Z"))) in {10, 11}
         assert len(asked(f"{key}?_time=[..]")) == MAX_REPLIES
         assert asked(f"{key}?after={10**17};_time=[..]") == []
+        assert len(asked(f"{key}?_time=[..];limit=3")) == 3
         events = client.get(f"{EVENT.under(SITE, MACHINE)}?_time=[..]", timeout=PATIENCE)
         assert len([reply for reply in events if reply.ok]) == 12
-        for wrong in ("_time=yesterday", "_time=[now(-1y)..]", "after=-1", "after=x", f"after={'9' * 40}"):
+        for wrong in (
+            "_time=yesterday",
+            "_time=[now(-1y)..]",
+            "after=-1",
+            "after=x",
+            "after=0;limit=-1",
+            f"after={'9' * 40}",
+        ):
             (reply,) = client.get(f"{key}?{wrong}", timeout=PATIENCE)
             assert reply.err is not None, wrong
             assert "write" in reply.err.payload.to_string() or "isoformat" in reply.err.payload.to_string()

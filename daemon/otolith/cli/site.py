@@ -38,6 +38,6 @@ def site(file: Path | None, verbose: bool) -> int:
     log_to_stderr(verbose=verbose)
     settings = SiteFile() if file is None else load_site(file)
     folder = Path() if file is None else file.parent.absolute()
-    collector = Collector(settings.connection(folder))
+    collector = Collector(settings.connection(folder), settings.machines)
     ended_by = run_site(collector, settings, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
     return INTERRUPTED if ended_by == signal.SIGINT else 0

@@ -1,36 +1,21 @@
 """A subscriber that gets each message once and in order, also those that were published while it was away."""
 
-import contextlib
 import json
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
-import zenoh
-
-from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
-from otolith.publishing.zenoh_session import (
-    ALIVE,
-    MAX_REPLIES,
-    REPORT,
-    START,
-    StartDocument,
-    Topic,
-    close_session,
-    session,
-)
-from otolith_drivers.errors import ServiceError
+from otolith.publishing.reader_sessions import QUERY_TIMEOUT, Arrival, ReaderSessions
+from otolith.publishing.zenoh_config import Connection
+from otolith.publishing.zenoh_session import MAX_REPLIES, REPORT, START, StartDocument, Topic
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-QUERY_TIMEOUT = 5.0  # s
 QUERY_TRIES = 5  # queries for what is missing
 QUERY_PAUSE = 0.5  # s between them
 QUERY_PERIOD = 10.0  # s between queries for what was lost on the way without a later message that shows it
 MAX_BEHIND = 1000  # messages that wait for on_message; later ones come from the history
-MAX_CONNECTING = 32  # endpoints that are tried at the same time
 MAX_KEYS = 1000  # of machines, of which the position is kept
 
 
@@ -145,19 +130,17 @@ class Subscriber:
         self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after, topics)
         site, _, name = machine.rpartition(".")
         self._site, self._machine, self._from_now = site or "*", name, after is None
-        self._endpoints = connection.endpoints
-        self._settings = reader_settings(connection.credentials, connection.endpoints)
-        self._sessions: dict[str, zenoh.Session] = {}
+        needed = {REPORT, START, *topics}  # a report also shows from where on events can be missing
+        self._sessions = ReaderSessions(connection, needed, self._receive, (self._site, name))
         self._starts: dict[str, StartDocument] = {}  # By the key of the machine, until its first report
-        self._declared: list[object] = []
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._connect, self._run)]
-        for thread in self._threads:
-            thread.start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._sessions.start()
 
     @property
     def connected(self) -> bool:
         """Whether a daemon or a router is connected."""
-        return any(each.info.peers_zid() or each.info.routers_zid() for each in tuple(self._sessions.values()))
+        return self._sessions.connected
 
     @property
     def starting(self) -> tuple[str, ...]:
@@ -166,7 +149,7 @@ class Subscriber:
 
     def state(self) -> str:
         """Return what it waits for, in words."""
-        addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
+        addresses = ", ".join(self._sessions.addresses)
         if self.connected and (starting := self.starting):
             return "; ".join(starting)
         if self.connected:
@@ -182,45 +165,16 @@ class Subscriber:
 
     def __exit__(self, *_: object) -> None:
         self._stopping.set()
-        self._close_sessions()  # ends their queries
-        for thread in self._threads:  # one that comes back from Zenoh while the interpreter ends would abort it
-            thread.join(QUERY_TIMEOUT)
-        self._close_sessions()  # one that is left open would keep the process alive
+        self._sessions.close()
+        self._thread.join(QUERY_TIMEOUT)
 
-    def _close_sessions(self) -> None:
-        while self._sessions:
-            close_session(self._sessions.popitem()[1])
-
-    def _connect(self) -> None:
-        """Open a session for each endpoint, as soon as something answers there; it reconnects by itself."""
-        with ThreadPoolExecutor(MAX_CONNECTING) as pool:
-            while not self._stopping.is_set():
-                missing = [each for each in self._endpoints or local_sockets() if each not in self._sessions]
-                tuple(pool.map(self._open, missing))
-                self._stopping.wait(QUERY_PAUSE)
-
-    def _open(self, endpoint: str) -> None:
-        with contextlib.suppress(ServiceError, zenoh.ZError):  # nothing answers there, or the session was closed
-            if not self._stopping.is_set():
-                opened = session((), [endpoint], self._settings, "client")
-                self._sessions[endpoint] = opened
-                self._declare(opened)
-
-    def _declare(self, opened: zenoh.Session) -> None:
-        for topic in {REPORT, START, *self._topics}:  # a report also shows from where on events can be missing
-            self._declared.append(opened.declare_subscriber(topic.under(self._site, self._machine), self._receive))
-        alive = ALIVE.under(self._site, self._machine)
-        self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._put(str(sample.key_expr), _text(sample))
-
-    def _receive_alive(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._put(str(sample.key_expr), None)
+    def _receive(self, arrival: Arrival) -> None:
+        if arrival.content is not None:
+            self._put(arrival.key, arrival.content.decode(errors="replace"))  # anybody may publish anything
+        elif arrival.is_alive:
+            self._put(arrival.key, None)
         else:
-            self._starts.pop(str(sample.key_expr).rpartition("/")[0], None)
+            self._starts.pop(arrival.machine, None)
 
     def _put(self, key: str, text: str | None) -> None:
         try:
@@ -281,21 +235,7 @@ class Subscriber:
         return self._get(f"{key}?after={after}")
 
     def _get(self, selector: str) -> list[str]:
-        none = zenoh.ConsolidationMode.NONE  # by default only the latest message of a key would be passed on
-        for each in tuple(self._sessions.values()):
-            try:
-                replies = each.get(selector, timeout=QUERY_TIMEOUT, consolidation=none)
-                texts = [_text(reply.ok) for reply in replies if reply.ok is not None]
-            except zenoh.ZError:  # the session was closed
-                continue
-            if texts:
-                return texts
-        return []
-
-
-def _text(sample: zenoh.Sample) -> str:
-    """Return the payload as text; anybody may publish anything."""
-    return sample.payload.to_bytes().decode(errors="replace")
+        return [content.decode(errors="replace") for _, content in self._sessions.get(selector)]
 
 
 def _numbers(text: str) -> tuple[int | None, int | None]:

@@ -44,17 +44,20 @@ class Selection:
     after: int = 0
     start: float | None = None  # Unix s, as end; None for no bound
     end: float | None = None
+    limit: int = MAX_REPLIES  # Documents, the first ones
 
 
 def selection(parameters: zenoh.Parameters, now: float) -> Selection | None:
     """Return what the parameters of a query select, None for nothing; raise ValueError if they are malformed."""
-    span, after = parameters.get("_time"), parameters.get("after")
+    span, after, limit = (parameters.get(name) for name in ("_time", "after", "limit"))
     if span is None and after is None:
         return None
     start, end = (None, None) if span is None else time_range(span, now)
-    if after is not None and not re.fullmatch(r"[0-9]{1,18}", after):
-        raise ValueError(f"after={after}: write a sequence number")
-    return Selection(int(after or 0), start, end)
+    for name, text in (("after", after), ("limit", limit)):
+        if text is not None and not re.fullmatch(r"[0-9]{1,18}", text):
+            what = "a sequence number" if name == "after" else f"a number of documents, at most {MAX_REPLIES}"
+            raise ValueError(f"{name}={text}: write {what}")
+    return Selection(int(after or 0), start, end, min(int(limit or MAX_REPLIES), MAX_REPLIES))
 
 
 def time_range(text: str, now: float) -> tuple[float | None, float | None]:
@@ -104,7 +107,7 @@ def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive:
     elif archive is None:
         texts = []
     else:
-        texts = archive.messages(kind, MAX_REPLIES, selected.after, selected.start, selected.end)
+        texts = archive.messages(kind, selected.limit, selected.after, selected.start, selected.end)
     for text in texts:
         query.reply(key, text, encoding="application/json")
 

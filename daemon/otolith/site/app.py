@@ -104,7 +104,7 @@ class Site:
     def __init__(self, collector: Collector, settings: SiteFile) -> None:
         self._collector, self._settings = collector, settings
         self._hall = Hall(collector.knowledge, settings.timezone)
-        self._live = 0
+        self._live = asyncio.Semaphore(MAX_LIVE)
         self._looking = asyncio.Semaphore(MAX_LOOKING)
         self._started = time.time()
 
@@ -163,20 +163,24 @@ class Site:
         window = report.window.end - report.window.start if report else 0.0
         query = PastQuery(site, name, now - SPANS.get(span, SPANS["1h"]), now, window)
         if self._looking.locked():
-            return PlainTextResponse("others are looking at the past of machines: try again in a few seconds\n", 503)
-        async with self._looking:
-            history = await run_in_threadpool(past_of, self._collector.ask, query, report)
-            page = await run_in_threadpool(received_page, history, query.since, now)
+            return self._message(language, "busy", 503)
+        try:
+            async with self._looking:
+                history = await run_in_threadpool(past_of, self._collector.ask, query, report)
+                page = await run_in_threadpool(received_page, history, query.since, now)
+        except ValueError:  # anybody may have published it
+            return self._message(language, "unreadable", 502)
         head = PAGES.get_template("spans.html").render(
             site=site, machine=name, spans=SPANS, span=span if span in SPANS else "1h", **self._frame(language)
         )
         return HTMLResponse(page.replace("<header>", f"{head}<header>", 1), headers={OWN_POLICY: REPORT_POLICY})
 
     async def _show_nothing(self, request: Request, _: Exception) -> Response:
-        language = self._language(request)
-        text = words_in(language)["not_found"]
-        page = PAGES.get_template("message.html").render(text=text, **self._frame(language))
-        return HTMLResponse(page, 404)
+        return self._message(self._language(request), "not_found", 404)
+
+    def _message(self, language: Language, word: str, status: int) -> Response:
+        text = words_in(language)[word]
+        return HTMLResponse(PAGES.get_template("message.html").render(text=text, **self._frame(language)), status)
 
     async def _show_metrics(self, _: Request) -> Response:
         with self._collector.lock:
@@ -190,41 +194,44 @@ class Site:
         return JSONResponse(status, 200 if is_connected else 503)
 
     async def _show_live(self, request: Request) -> Response:
-        if self._live >= MAX_LIVE:
-            return PlainTextResponse(f"{MAX_LIVE} browsers get live events already\n", 503)
-        return _Live(partial(self._changes, self._language(request), _filter(request)))
+        return _Live(partial(self._changes, self._language(request), _filter(request)), self._live)
 
     async def _changes(self, language: Language, chosen: Filter, send: Callable[[str], Awaitable[None]]) -> None:
         """Send the cards that changed, once in a tick; at first all."""
         known: dict[str, int] = {}
-        self._live += 1
-        try:
-            while True:
-                now = time.time()
-                with self._collector.lock:
-                    cards, counts = self._hall.cards(now, language, chosen), self._hall.counts(now)
-                    total = len(self._collector.knowledge)
-                changes: dict[str, str | None] = {
-                    key: html for key, html in cards.items() if known.get(key) != hash(html)
-                }
-                changes |= dict.fromkeys(known.keys() - cards.keys())
-                known = {key: hash(html) for key, html in cards.items()}
-                numbers = {level.name: count for level, count in counts.items()} | {"all": total}
-                events = [("card", {"id": key, "html": html}) for key, html in changes.items()] + [("counts", numbers)]
-                await send("".join(f"event: {name}\ndata: {json.dumps(content)}\n\n" for name, content in events))
-                await asyncio.sleep(TICK)
-        finally:
-            self._live -= 1
+        while True:
+            now = time.time()
+            with self._collector.lock:
+                cards, counts = self._hall.cards(now, language, chosen), self._hall.counts(now)
+                total = len(self._collector.knowledge)
+            changes: dict[str, str | None] = {key: html for key, html in cards.items() if known.get(key) != hash(html)}
+            changes |= dict.fromkeys(known.keys() - cards.keys())
+            known = {key: hash(html) for key, html in cards.items()}
+            numbers = {level.name: count for level, count in counts.items()} | {"all": total}
+            events = [("card", {"id": key, "html": html}) for key, html in changes.items()] + [("counts", numbers)]
+            await send("".join(f"event: {name}\ndata: {json.dumps(content)}\n\n" for name, content in events))
+            await asyncio.sleep(TICK)
 
 
 class _Live(Response):
     """A stream of server-sent events; a reader that does not take one in time is disconnected."""
 
-    def __init__(self, run: Callable[[Callable[[str], Awaitable[None]]], Awaitable[None]]) -> None:
+    def __init__(
+        self, run: Callable[[Callable[[str], Awaitable[None]]], Awaitable[None]], free: asyncio.Semaphore
+    ) -> None:
+        """``free`` has a place for each stream that may run."""
         super().__init__(media_type="text/event-stream")
-        self._run = run
+        self._run, self._free = run, free
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if self._free.locked():
+            text = f"{MAX_LIVE} browsers get live events already\n"
+            await PlainTextResponse(text, 503)(scope, receive, send)
+            return
+        async with self._free:
+            await self._stream(receive, send)
+
+    async def _stream(self, receive: Receive, send: Send) -> None:
         headers = [(name, value) for name, value in self.raw_headers if name != b"content-length"]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
 

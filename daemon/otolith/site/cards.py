@@ -8,6 +8,7 @@ from otolith.health.schema import EventDocument, Language, ReportDocument
 from otolith.health.text import Texts, texts_in, undecided_advice, undecided_text, zone_of
 from otolith.health.times import in_local_time, moment_text
 from otolith.site.known import KnownMachine, Trend, share_of
+from otolith.site.words import words_in
 from otolith_drivers.outside_text import visible
 
 MAX_SHOWN = 240  # characters of a text on a card: engineering choice, four lines of a phone
@@ -49,6 +50,8 @@ def card_of(machine: KnownMachine, now: float, language: Language, zone: str | N
         health = report.health
         since = "" if health is None else moment_text(health.since, own_zone)
         what, advice = _reason(report, texts, own_zone)
+    if machine.has_rival(now):
+        what, advice = words_in(language)["rival"], words_in(language)["rival_advice"]
     nearest = machine.nearest
     return Card(
         site=machine.site, name=machine.name, state=state, symbol=SYMBOLS[state], word=texts.translated(state),

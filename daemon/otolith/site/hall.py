@@ -9,13 +9,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from otolith.health.limits import Level
-from otolith.health.schema import Language
+from otolith.health.schema import LANGUAGES, Language
 from otolith.health.text import texts_in
 from otolith.site.cards import SYMBOLS, card_of
-from otolith.site.known import Knowledge, KnownMachine
+from otolith.site.known import MAX_MACHINES, Knowledge, KnownMachine
 from otolith.site.words import words_in
 
 SHOWN = (Level.ACT, Level.WATCH, Level.NO_DATA, Level.OK)  # States of machines, the most severe first
+MAX_RENDERED = 2 * len(LANGUAGES) * MAX_MACHINES  # cards that are kept
 PAGES = Environment(
     loader=PackageLoader("otolith.site", "pages"),
     autoescape=True,
@@ -81,9 +82,12 @@ class Hall:
 
     def _html(self, machine: KnownMachine, state: Level, now: float, language: Language) -> str:
         silence = int((now - machine.heard) // 60.0) if state is Level.NO_DATA else 0
-        key, basis = (language, machine.site, machine.name), (machine.revision, state, silence)
+        key = (language, machine.site, machine.name)
+        basis = (machine.revision, state, silence, machine.has_rival(now))
         known = self._rendered.get(key)
         if known is None or known.basis != basis:
+            if len(self._rendered) >= MAX_RENDERED:  # machines are forgotten, too
+                self._rendered.clear()
             card = card_of(machine, now, language, self._zone)
             health = machine.report.health if machine.report else None
             since = health.since if health else 0.0

@@ -1,12 +1,13 @@
 """What is known of each machine of a site, from the documents that its daemons publish.
 
 It has no clock: each call says what time it is, in Unix s of the computer of the site. Anybody may publish anything to
-a router, so a document counts only if it can be read, is not too large, and is of the machine that its key names.
+a router without access control, so a document counts only if it can be read, is not too large, and is of the machine
+that its key names. Invented machines take the place of other invented ones, not of those that report for longer.
 """
 
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -25,7 +26,11 @@ MAX_POINTS = 48  # of a curve
 MAX_PAUSE = 1800.0  # s between two points of a curve
 SILENT_WINDOWS = 3.0  # lengths of a window without a report, and ...
 SILENT_SLACK = 5.0  # ... s beside them, until nothing is known of a machine
-RENUMBERED_AFTER = 30.0  # s without a report after which a lower number counts
+MAX_WINDOW = 600.0  # s: the longest window by which the silence of a machine is judged
+ESTABLISHED = 10  # reports after which a machine keeps its place for as long as FORGET_AFTER
+FORGET_AFTER = 604_800.0  # s without a report after which a machine may lose its place
+RIVALS = 2  # times that a lower number followed within RIVAL_SPAN, from which two daemons have one name
+RIVAL_SPAN = 600.0  # s
 
 
 class Refusal(StrEnum):
@@ -34,8 +39,8 @@ class Refusal(StrEnum):
     TOO_LARGE = "too_large"
     UNREADABLE = "unreadable"  # No document of a version that is known here
     OTHER_NAME = "other_name"  # Of another machine than its key
-    NUMBER = "number"  # A report with a lower number than the last one, which has just come: two publish it
-    TOO_MANY = "too_many"  # More machines, or larger reports, than there is room for
+    NUMBER = "number"  # A report with a lower number than the last one, and none before it in its order
+    TOO_MANY = "too_many"  # More machines, or larger reports, than there is room for, or than are expected
 
 
 @dataclass(slots=True)
@@ -72,15 +77,23 @@ class KnownMachine:
     is_alive: bool = True  # Whether its daemon runs
     events: dict[str, EventDocument] = field(default_factory=dict)  # By id; the last change of each
     trends: dict[str, Trend] = field(default_factory=dict)  # Of parameters that have a limit
-    revision: int = 0  # Rises with each document
+    revision: int = 0  # Another one after each document
     size: int = 0  # Bytes of its report
+    reports: int = 0  # That were taken
+    is_asked: bool = False  # Whether its daemon was asked for its past
+    refused: int | None = None  # Number of the last report that was refused because of it
+    restarts: tuple[float, ...] = ()  # When a lower number followed
 
     def is_silent(self, now: float) -> bool:
         """Whether nothing is known at present."""
         if self.report is None or not self.is_alive:
             return True
         window = self.report.window
-        return now - self.heard > SILENT_WINDOWS * (window.end - window.start) + SILENT_SLACK
+        return now - self.heard > SILENT_WINDOWS * min(window.end - window.start, MAX_WINDOW) + SILENT_SLACK
+
+    def has_rival(self, now: float) -> bool:
+        """Whether two daemons publish under its name, or one that does not keep its numbers starts again and again."""
+        return len(self.restarts) >= RIVALS and now - self.restarts[-RIVALS] <= RIVAL_SPAN
 
     def state(self, now: float) -> Level:
         """Return its state: that of its report, or NO DATA."""
@@ -110,11 +123,18 @@ def share_of(parameter: ParameterDocument) -> float | None:
 class Knowledge:
     """All machines. It is of one thread at a time."""
 
-    def __init__(self) -> None:
-        self._machines: dict[str, KnownMachine] = {}
-        self._bytes = 0
+    def __init__(self, expected: Iterable[str] = ()) -> None:
+        """``expected`` has ``site/machine`` of each machine that is taken, at most :data:`MAX_MACHINES`; empty for all.
+
+        They are known before they are heard, so that one that never reports is seen.
+        """
+        names = {key: key.partition("/") for key in expected}
+        self._machines = {key: KnownMachine(site, name, is_alive=False) for key, (site, _, name) in names.items()}
+        self._is_open = not self._machines
+        self._bytes = self._revision = 0
         self.refused: Counter[Refusal] = Counter()
         self.taken = 0  # Documents
+        self.forgotten = 0  # Machines that lost their place
 
     def __iter__(self) -> Iterator[KnownMachine]:
         return iter(self._machines.values())
@@ -135,84 +155,123 @@ class Knowledge:
 
         return sorted(self, key=order)
 
-    def take(self, key: str, content: bytes, now: float, *, is_past: bool = False) -> bool:
+    def take(self, key: str, content: bytes, now: float, *, is_past: bool = False) -> KnownMachine | None:
         """Take a document that came under a key; ``is_past`` of an answer, which may have been published long before.
 
-        Return whether it was taken, or had been before.
+        Return its machine if it was taken, or had been before.
         """
         if (identity := _identity(key)) is None:
-            return False
+            return None
         site, name, topic = identity
-        refusal = Refusal.TOO_LARGE if len(content) > MAX_BYTES else None
-        if refusal is None:
+        taken: KnownMachine | Refusal = Refusal.TOO_LARGE
+        if len(content) <= MAX_BYTES:
             try:
                 if topic == REPORT.key:
-                    refusal = self._take_report(site, name, content, now, is_past=is_past)
+                    taken = self._take_report(site, name, content, now, is_past=is_past)
                 else:
-                    refusal = self._take_event(site, name, content)
+                    taken = self._take_event(site, name, content, now)
             except ValueError:  # ValidationError and UnicodeDecodeError are ValueErrors
-                refusal = Refusal.UNREADABLE
-        if refusal is not None:
-            self.refused[refusal] += 1
-            return False
+                taken = Refusal.UNREADABLE
+        if isinstance(taken, Refusal):
+            self.refused[taken] += 1
+            return None
         self.taken += 1
-        return True
+        return taken
 
-    def take_alive(self, key: str, *, is_alive: bool) -> None:
-        """Take that a daemon runs, or does not any more."""
+    def take_alive(self, key: str, now: float, *, is_alive: bool) -> KnownMachine | None:
+        """Take that a daemon runs, or does not any more; return its machine if it is known."""
         if (identity := _identity(key)) is None or identity[2] != ALIVE.key:
-            return
-        machine = self._machine(*identity[:2]) if is_alive else self.get(*identity[:2])
+            return None
+        machine = self._machine(*identity[:2], now) if is_alive else self.get(*identity[:2])
         if machine is None:
             self.refused[Refusal.TOO_MANY] += is_alive
         elif machine.is_alive is not is_alive:
             machine.is_alive = is_alive
-            machine.revision += 1
+            self._changed(machine)
+        return machine
 
-    def _machine(self, site: str, name: str) -> KnownMachine | None:
-        """Return a machine, a new one if there is room."""
+    def _machine(self, site: str, name: str, now: float, size: int = 0) -> KnownMachine | None:
+        """Return a machine, a new one if there is room, or room is made, for it and for so many bytes more."""
         known = self.get(site, name)
-        if known is None and len(self._machines) < MAX_MACHINES:
-            known = self._machines[f"{site}/{name}"] = KnownMachine(site, name)
+        if known is None and not self._is_open:
+            return None
+        while len(self._machines) + (known is None) > MAX_MACHINES or self._bytes + size > MAX_TOTAL_BYTES:
+            if not self._forget(now, known):
+                return None
+        if known is None:
+            known = self._machines[f"{site}/{name}"] = KnownMachine(site, name, heard=now)
         return known
 
-    def _take_report(self, site: str, name: str, content: bytes, now: float, *, is_past: bool) -> Refusal | None:
+    def _changed(self, machine: KnownMachine) -> None:
+        self._revision += 1
+        machine.revision = self._revision
+
+    def _forget(self, now: float, keep: KnownMachine | None) -> bool:
+        """Make room: forget the machine that matters least; return whether there was one."""
+        if not self._is_open:
+            return False
+        passing = [machine for machine in self if machine is not keep and machine.is_silent(now)
+                   and (machine.reports < ESTABLISHED or now - machine.heard > FORGET_AFTER)]  # fmt: skip
+        if not passing:
+            return False
+        least = min(passing, key=lambda machine: (machine.reports >= ESTABLISHED, machine.reports, machine.heard))
+        del self._machines[f"{least.site}/{least.name}"]
+        self._bytes -= least.size
+        self.forgotten += 1
+        return True
+
+    def _take_report(
+        self, site: str, name: str, content: bytes, now: float, *, is_past: bool
+    ) -> KnownMachine | Refusal:
         text = content.decode().replace('"schema"', '"schema_"', 1)
         report = ReportDocument.model_validate_json(text, extra="ignore")  # a later version may write more
         if (report.site, report.machine) != (site, name):
             return Refusal.OTHER_NAME
         known, heard = self.get(site, name), min(now, report.window.end) if is_past else now
-        if known is not None and (step := _step(known, report)) is not None and now - known.heard < RENUMBERED_AFTER:
-            if step == 0 or (step < 0 and is_past):
-                return None
-            if step < 0:
+        if known is not None and (step := _step(known, report)) is not None and step <= 0:
+            if step == 0 or is_past:
+                return known
+            before, known.refused = known.refused, report.sequence
+            if before is None or (report.sequence or 0) <= before:  # one that comes late
                 return Refusal.NUMBER
-        total = self._bytes + len(content) - (known.size if known else 0)
-        machine = self._machine(site, name) if total <= MAX_TOTAL_BYTES else None
+            known.refused, known.restarts = None, (*known.restarts, now)[-RIVALS:]  # the numbers go on from there
+        machine = self._machine(site, name, now, len(content) - (known.size if known else 0))
         if machine is None:
             return Refusal.TOO_MANY
-        self._bytes, machine.size = total, len(content)
+        self._bytes += len(content) - machine.size
+        machine.size, machine.reports = len(content), machine.reports + 1
         machine.report, machine.heard, machine.is_alive = report, heard, True
-        machine.revision += 1
+        self._changed(machine)
         for event in report.events:
             _keep(machine, event)
+        _end_others(machine, report)
         _follow(machine, report)
-        return None
+        return machine
 
-    def _take_event(self, site: str, name: str, content: bytes) -> Refusal | None:
+    def _take_event(self, site: str, name: str, content: bytes, now: float) -> KnownMachine | Refusal:
         event = EventDocument.model_validate_json(content, extra="ignore")
-        machine = self._machine(site, name)
+        machine = self._machine(site, name, now)
         if machine is None:
             return Refusal.TOO_MANY
         _keep(machine, event)
-        machine.revision += 1
-        return None
+        if machine.report is not None:
+            _end_others(machine, machine.report)
+        self._changed(machine)
+        return machine
 
 
 def _step(known: KnownMachine, report: ReportDocument) -> int | None:
     """Return by how much the number of a report is higher than the last one; None without numbers."""
     before = known.report.sequence if known.report else None
     return None if before is None or report.sequence is None else report.sequence - before
+
+
+def _end_others(machine: KnownMachine, report: ReportDocument) -> None:
+    """End the events that a report does not have, if no report said when they ended."""
+    open_ids = {event.id for event in report.events}
+    for key, event in machine.events.items():
+        if event.end is None and key not in open_ids and event.start < report.window.end:
+            machine.events[key] = event.model_copy(update={"end": max(event.since, report.window.start)})
 
 
 def _follow(machine: KnownMachine, report: ReportDocument) -> None:

@@ -35,7 +35,7 @@ def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> Receiv
     """Return the history of a machine; ``ask`` returns what daemons answer to a selector, with a limit."""
     pieces = tuple(_pieces(query))
     key = REPORT.under(query.site, query.machine)
-    selectors = [f"{key}?_time=[{_moment(begin)}..{_moment(end)}]" for begin, end in pieces]
+    selectors = [f"{key}?_time=[{_moment(begin)}..{_moment(end)}];limit=1" for begin, end in pieces]
     with ThreadPoolExecutor(PARALLEL) as pool:
         answers = pool.map(lambda selector: ask(selector, 1), selectors)
         reports = {report.window.end: report for content in answers for report in _reports(content, query)}
@@ -48,12 +48,10 @@ def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> Receiv
 
 def _pieces(query: PastQuery) -> Iterator[tuple[float, float]]:
     """Yield the spans that are asked for, one report of each."""
-    length = max(query.window, MIN_WINDOW)
-    count = min(POINTS, max(int((query.until - query.since) / length), 1))
+    count = min(POINTS, max(int((query.until - query.since) / max(query.window, MIN_WINDOW)), 1))
     step = (query.until - query.since) / count
     for index in range(count):
-        begin = query.since + index * step
-        yield begin, begin + min(1.5 * length, step)
+        yield query.since + index * step, query.since + (index + 1) * step
 
 
 def _moment(seconds: float) -> str:

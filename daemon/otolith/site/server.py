@@ -75,6 +75,7 @@ def run_site(collector: Collector, settings: SiteFile, ready: Callable[[str], No
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind((host, port))
+            listening.listen(BACKLOG)
         except OSError as error:
             remedy = "set http.listen to another address"
             raise ServiceError(f"http.listen = {settings.http.listen}: {error.strerror}; {remedy}") from error

@@ -4,11 +4,13 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from otolith.health.schema import Language
-from otolith.machine_file import Endpoint
+from otolith.machine_file import Endpoint, check_name
 from otolith.publishing.zenoh_config import Connection, Credentials
+from otolith.site.known import MAX_MACHINES
+from otolith_drivers.common.time_zones import check_time_zone
 from otolith_drivers.config_files import StrictModel, parse, read, validate
 
 OWN_HOSTS = ("localhost", "127.0.0.1", "::1")
@@ -24,6 +26,17 @@ def _address(text: str) -> str:
         is_port = False
     if not is_port:
         raise ValueError(f'{text!r} is no address with a port: write it like "127.0.0.1:8420" or "[::1]:8420"')
+    return text
+
+
+def _identity(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no site with a machine."""
+    site, _, name = text.partition("/")
+    try:
+        check_name(site)
+        check_name(name)
+    except ValueError as error:
+        raise ValueError(f'{error}; write site and name like "hall-1/press-3"') from None
     return text
 
 
@@ -62,7 +75,9 @@ class SiteFile(StrictModel):
 
     title: str = "Otolith"
     language: Language | None = None  # By default that of the browser
-    timezone: str | None = None  # By default that of each machine
+    timezone: Annotated[str, AfterValidator(check_time_zone)] | None = None  # By default that of each machine
+    machines: Annotated[tuple[Annotated[str, AfterValidator(_identity)], ...], Field(max_length=MAX_MACHINES)] = ()
+    """Site and name of each machine that is shown; by default all that report."""
     http: HttpTable = HttpTable()
     zenoh: ReadersTable = ReadersTable()
 

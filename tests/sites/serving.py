@@ -1,0 +1,74 @@
+"""A site as a process of its own, and requests to it."""
+
+import http.client
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.conftest import free_port
+from tests.waiting import PATIENCE
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a request was answered with."""
+
+    status: int
+    headers: dict[str, str]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A site that runs."""
+
+    port: int
+    process: "subprocess.Popen[str]" = field(repr=False)
+
+    @property
+    def address(self) -> str:
+        """Of its hall."""
+        return f"http://127.0.0.1:{self.port}/"
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> Answer:
+        """Send a request with headers, and return its answer; ``host`` replaces its own."""
+        connection = self.open(path, method, **headers)
+        answer = connection.getresponse()
+        found = {name.lower(): value for name, value in answer.getheaders()}
+        text = answer.read().decode()
+        connection.close()
+        return Answer(answer.status, found, text)
+
+    def open(self, path: str, method: str = "GET", **headers: str) -> http.client.HTTPConnection:
+        """Send a request, and return its connection."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        own = {"host": f"127.0.0.1:{self.port}"} | {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.putrequest(method, path, skip_host=True)
+        for name, value in own.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        return connection
+
+
+@contextmanager
+def serving(folder: Path, *endpoints: str, more: str = "", tables: str = "") -> Iterator[Served]:
+    """A site that reads endpoints; ``more`` are lines at the begin of its file, ``tables`` at its end."""
+    port = free_port(socket.SOCK_STREAM)
+    file = folder / "site.toml"
+    file.write_text(
+        f'{more}\n[http]\nlisten = "127.0.0.1:{port}"\n[zenoh]\nconnect = {list(endpoints)}\n{tables}', encoding="utf-8"
+    )
+    command = [sys.executable, "-m", "otolith", "site", str(file)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            line = process.stderr.readline()
+            assert f"http://127.0.0.1:{port}/" in line, line
+            yield Served(port, process)
+        finally:
+            process.terminate()
+            process.communicate(timeout=PATIENCE)

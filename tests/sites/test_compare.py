@@ -1,0 +1,50 @@
+"""Machines of one twin beside each other, and the events of a week."""
+
+import pytest
+
+from otolith.health.limits import Level
+from otolith.site.compare import MIN_SISTERS, WEEK, sisters, week
+from otolith.site.known import Knowledge
+from tests.sites.machines import raised, report_of, sent
+from tests.storage.histories import START
+
+
+def known(*values: float) -> Knowledge:
+    knowledge = Knowledge()
+    for index, value in enumerate(values):
+        knowledge.take(*sent(report_of(f"m-{index}", value=value)), START)
+    return knowledge
+
+
+@pytest.mark.parametrize(
+    ("values", "marked"),
+    [
+        ((6.50, 6.51, 6.52, 6.49, 6.50, 7.2), {"m-5"}),
+        ((6.50, 6.51, 6.52, 6.49, 6.50, 6.53), set()),
+        ((6.5, 6.5, 6.5, 6.5), set()),
+        ((6.5, 6.5, 7.2), set()),  # of three it would be decided by one
+    ],
+)
+def test_a_machine_that_differs_from_its_sisters_is_marked(values: tuple[float, ...], marked: set[str]) -> None:
+    (rows,) = sisters(known(*values), START, "en").values()
+    assert {row.machine.name for row in rows if row.is_outlier} == marked
+    assert len(rows) == len(values)
+    assert len(values) >= MIN_SISTERS or not marked
+    assert rows[0].machine.name == f"m-{values.index(max(values))}"  # the nearest to its limit first
+
+
+def test_one_machine_has_no_sisters() -> None:
+    assert sisters(known(6.5), START, "en") == {}
+
+
+def test_the_events_of_a_week_are_the_newest_first_without_hints_and_older_ones() -> None:
+    knowledge = Knowledge()
+    day = WEEK / 7.0
+    own = [raised(time=START - age * day).model_copy(update={"id": str(age), "end": START - age * day + 60.0})
+           for age in (8, 3, 1)]  # fmt: skip
+    hint = raised(Level.HINT, START - 2.0 * day).model_copy(update={"id": "hint"})
+    still_open = raised(time=START - 30.0 * day).model_copy(update={"id": "open"})
+    knowledge.take(*sent(report_of(events=(*own, hint, still_open))), START)
+    rows = week(knowledge, START, "en", "UTC")
+    assert [row.state for row in rows] == ["OK", "OK", "ACT"]
+    assert [row.time[:10] for row in rows] == ["2023-11-13", "2023-11-11", "2023-10-15"]
