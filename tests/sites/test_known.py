@@ -22,8 +22,8 @@ from otolith.site.known import (
     RIVAL_SPAN,
     Knowledge,
     KnownMachine,
-    Refusal,
-    Trend,
+    RefusedFor,
+    Trace,
 )
 from tests.hostile import HOSTILE, hostile_text
 from tests.sites.machines import raised, report_of, sent
@@ -57,16 +57,16 @@ def test_a_report_makes_its_machine_known_with_its_state() -> None:
 @pytest.mark.parametrize(
     ("key", "content", "refusal"),
     [
-        (f"otolith/{SITE}/{MACHINE}/report", b"\xff\xfe", Refusal.UNREADABLE),
-        (f"otolith/{SITE}/{MACHINE}/report", b"{}", Refusal.UNREADABLE),
-        (f"otolith/{SITE}/{MACHINE}/report", b"[" * 100_000, Refusal.UNREADABLE),
-        (f"otolith/{SITE}/{MACHINE}/event", sent(report_of())[1], Refusal.UNREADABLE),
-        (f"otolith/{SITE}/{MACHINE}/report", b" " * MAX_BYTES + sent(report_of())[1], Refusal.TOO_LARGE),
-        (f"otolith/{SITE}/another/report", sent(report_of())[1], Refusal.OTHER_NAME),
-        (f"otolith/other/{MACHINE}/report", sent(report_of())[1], Refusal.OTHER_NAME),
+        (f"otolith/{SITE}/{MACHINE}/report", b"\xff\xfe", RefusedFor.UNREADABLE),
+        (f"otolith/{SITE}/{MACHINE}/report", b"{}", RefusedFor.UNREADABLE),
+        (f"otolith/{SITE}/{MACHINE}/report", b"[" * 100_000, RefusedFor.UNREADABLE),
+        (f"otolith/{SITE}/{MACHINE}/event", sent(report_of())[1], RefusedFor.UNREADABLE),
+        (f"otolith/{SITE}/{MACHINE}/report", b" " * MAX_BYTES + sent(report_of())[1], RefusedFor.TOO_LARGE),
+        (f"otolith/{SITE}/another/report", sent(report_of())[1], RefusedFor.OTHER_NAME),
+        (f"otolith/other/{MACHINE}/report", sent(report_of())[1], RefusedFor.OTHER_NAME),
     ],
 )  # fmt: skip
-def test_a_document_that_does_not_count_is_counted_by_its_reason(key: str, content: bytes, refusal: Refusal) -> None:
+def test_a_document_that_does_not_count_is_counted_by_its_reason(key: str, content: bytes, refusal: RefusedFor) -> None:
     knowledge = Knowledge()
     assert knowledge.take(key, content, START) is None
     assert dict(knowledge.refused) == {refusal: 1}
@@ -181,7 +181,7 @@ def test_invented_machines_take_no_place_from_those_that_report() -> None:
         knowledge.take_alive(f"otolith/{SITE}/alive-{index}/alive", now + 0.1 * index, is_alive=True)
     assert len(knowledge) == MAX_MACHINES
     assert knowledge.get(SITE, "true") is not None
-    assert knowledge.refused[Refusal.TOO_MANY] + knowledge.forgotten >= 5 * MAX_MACHINES
+    assert knowledge.refused[RefusedFor.TOO_MANY] + knowledge.forgotten >= 5 * MAX_MACHINES
     late = now + 0.1 * 3 * MAX_MACHINES + 60.0
     assert take(knowledge, report_of("new", end=late)) is not None
     assert len(knowledge) == MAX_MACHINES
@@ -212,7 +212,7 @@ def test_large_reports_do_not_fill_the_memory() -> None:
         content[report.machine] = len(sent(report)[1])
         take(knowledge, report)
     assert sum(content[machine.name] for machine in knowledge) <= MAX_TOTAL_BYTES
-    assert knowledge.refused[Refusal.TOO_MANY] > 0
+    assert knowledge.refused[RefusedFor.TOO_MANY] > 0
 
 
 def test_a_curve_and_the_events_of_a_machine_are_bounded() -> None:
@@ -230,7 +230,7 @@ def test_a_curve_and_the_events_of_a_machine_are_bounded() -> None:
 
 @given(st.lists(st.floats(0.1, 4000.0), min_size=1, max_size=400))
 def test_a_curve_has_few_points_in_the_order_of_time_and_ends_near_the_last(pauses: list[float]) -> None:
-    trend, time = Trend(), START
+    trend, time = Trace(), START
     for pause in pauses:
         time += pause
         trend.add(time, time)

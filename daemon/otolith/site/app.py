@@ -98,7 +98,7 @@ def host_named(header: str) -> str:
         return ""
 
 
-class Site:
+class SitePages:
     """The handlers of all addresses."""
 
     def __init__(self, collector: Collector, settings: SiteFile) -> None:

@@ -7,7 +7,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, Language, ReportDocument
 from otolith.health.text import Texts, texts_in, undecided_advice, undecided_text, zone_of
 from otolith.health.times import in_local_time, moment_text
-from otolith.site.known import KnownMachine, Trend, share_of
+from otolith.site.known import KnownMachine, Trace, share_of
 from otolith.site.words import words_in
 from otolith_drivers.outside_text import visible
 
@@ -108,7 +108,7 @@ def _points(machine: KnownMachine, name: str) -> str:
     )))  # fmt: skip
 
 
-def _scaled(trend: Trend, shares: Iterable[float]) -> Iterable[str]:
+def _scaled(trend: Trace, shares: Iterable[float]) -> Iterable[str]:
     begin, end = trend.times[0], trend.times[-1]
     for time, share in zip(trend.times, shares, strict=True):
         x = WIDTH * (time - begin) / max(end - begin, 1e-9)

@@ -33,7 +33,7 @@ RIVALS = 2  # times that a lower number followed within RIVAL_SPAN, from which t
 RIVAL_SPAN = 600.0  # s
 
 
-class Refusal(StrEnum):
+class RefusedFor(StrEnum):
     """Why a document was not taken."""
 
     TOO_LARGE = "too_large"
@@ -44,7 +44,7 @@ class Refusal(StrEnum):
 
 
 @dataclass(slots=True)
-class Trend:
+class Trace:
     """The values of a parameter: at first each, later fewer, so that they cover up to a day."""
 
     times: "array[float]" = field(default_factory=lambda: array("d"))
@@ -76,7 +76,7 @@ class KnownMachine:
     heard: float = 0.0  # When its last report came
     is_alive: bool = True  # Whether its daemon runs
     events: dict[str, EventDocument] = field(default_factory=dict)  # By id; the last change of each
-    trends: dict[str, Trend] = field(default_factory=dict)  # Of parameters that have a limit
+    trends: dict[str, Trace] = field(default_factory=dict)  # Of parameters that have a limit
     revision: int = 0  # Another one after each document
     size: int = 0  # Bytes of its report
     reports: int = 0  # That were taken
@@ -132,7 +132,7 @@ class Knowledge:
         self._machines = {key: KnownMachine(site, name, is_alive=False) for key, (site, _, name) in names.items()}
         self._is_open = not self._machines
         self._bytes = self._revision = 0
-        self.refused: Counter[Refusal] = Counter()
+        self.refused: Counter[RefusedFor] = Counter()
         self.taken = 0  # Documents
         self.forgotten = 0  # Machines that lost their place
 
@@ -163,7 +163,7 @@ class Knowledge:
         if (identity := _identity(key)) is None:
             return None
         site, name, topic = identity
-        taken: KnownMachine | Refusal = Refusal.TOO_LARGE
+        taken: KnownMachine | RefusedFor = RefusedFor.TOO_LARGE
         if len(content) <= MAX_BYTES:
             try:
                 if topic == REPORT.key:
@@ -171,8 +171,8 @@ class Knowledge:
                 else:
                     taken = self._take_event(site, name, content, now)
             except ValueError:  # ValidationError and UnicodeDecodeError are ValueErrors
-                taken = Refusal.UNREADABLE
-        if isinstance(taken, Refusal):
+                taken = RefusedFor.UNREADABLE
+        if isinstance(taken, RefusedFor):
             self.refused[taken] += 1
             return None
         self.taken += 1
@@ -184,7 +184,7 @@ class Knowledge:
             return None
         machine = self._machine(*identity[:2], now) if is_alive else self.get(*identity[:2])
         if machine is None:
-            self.refused[Refusal.TOO_MANY] += is_alive
+            self.refused[RefusedFor.TOO_MANY] += is_alive
         elif machine.is_alive is not is_alive:
             machine.is_alive = is_alive
             self._changed(machine)
@@ -222,22 +222,22 @@ class Knowledge:
 
     def _take_report(
         self, site: str, name: str, content: bytes, now: float, *, is_past: bool
-    ) -> KnownMachine | Refusal:
+    ) -> KnownMachine | RefusedFor:
         text = content.decode().replace('"schema"', '"schema_"', 1)
         report = ReportDocument.model_validate_json(text, extra="ignore")  # a later version may write more
         if (report.site, report.machine) != (site, name):
-            return Refusal.OTHER_NAME
+            return RefusedFor.OTHER_NAME
         known, heard = self.get(site, name), min(now, report.window.end) if is_past else now
         if known is not None and (step := _step(known, report)) is not None and step <= 0:
             if step == 0 or is_past:
                 return known
             before, known.refused = known.refused, report.sequence
             if before is None or (report.sequence or 0) <= before:  # one that comes late
-                return Refusal.NUMBER
+                return RefusedFor.NUMBER
             known.refused, known.restarts = None, (*known.restarts, now)[-RIVALS:]  # the numbers go on from there
         machine = self._machine(site, name, now, len(content) - (known.size if known else 0))
         if machine is None:
-            return Refusal.TOO_MANY
+            return RefusedFor.TOO_MANY
         self._bytes += len(content) - machine.size
         machine.size, machine.reports = len(content), machine.reports + 1
         machine.report, machine.heard, machine.is_alive = report, heard, True
@@ -248,11 +248,11 @@ class Knowledge:
         _follow(machine, report)
         return machine
 
-    def _take_event(self, site: str, name: str, content: bytes, now: float) -> KnownMachine | Refusal:
+    def _take_event(self, site: str, name: str, content: bytes, now: float) -> KnownMachine | RefusedFor:
         event = EventDocument.model_validate_json(content, extra="ignore")
         machine = self._machine(site, name, now)
         if machine is None:
-            return Refusal.TOO_MANY
+            return RefusedFor.TOO_MANY
         _keep(machine, event)
         if machine.report is not None:
             _end_others(machine, machine.report)
@@ -280,7 +280,7 @@ def _follow(machine: KnownMachine, report: ReportDocument) -> None:
         value = row.value if row.referred is None else row.referred
         has_room = name in machine.trends or len(machine.trends) < MAX_TRENDS
         if row.limit is not None and value is not None and has_room:
-            machine.trends.setdefault(name, Trend()).add(report.window.end, value)
+            machine.trends.setdefault(name, Trace()).add(report.window.end, value)
 
 
 def _keep(machine: KnownMachine, event: EventDocument) -> None:

@@ -10,7 +10,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from otolith.publishing.zenoh_config import raise_descriptor_limit
-from otolith.site.app import Site
+from otolith.site.app import SitePages
 from otolith.site.collector import Collector
 from otolith.site.settings import SiteFile
 from otolith_drivers.errors import ServiceError
@@ -67,8 +67,8 @@ def run_site(collector: Collector, settings: SiteFile, ready: Callable[[str], No
     host, port = settings.http.address
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     config = uvicorn.Config(
-        Site(collector, settings).app(), http=_Patient, ws="none", lifespan="off", log_config=None, access_log=False,
-        server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS, backlog=BACKLOG,
+        SitePages(collector, settings).app(), http=_Patient, ws="none", lifespan="off", log_config=None,
+        access_log=False, server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS, backlog=BACKLOG,
         timeout_keep_alive=KEEP_ALIVE, timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
     )  # fmt: skip
     with socket.socket(family, socket.SOCK_STREAM) as listening:
