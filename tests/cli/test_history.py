@@ -20,10 +20,11 @@ from otolith.cli import common
 from otolith.cli.machines import last_spoken
 from otolith.cli.main import cli
 from otolith.cli.operation.history import end_of
+from otolith.health.labels import Numbers
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, HealthDocument
 from otolith.storage.history import HOUR, HistoryReader, history_path
-from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import state_directory
 from tests.conftest import EXAMPLES

@@ -15,9 +15,10 @@ from otolith.cli.machines import file_of, key_of, last_spoken, reader_of
 from otolith.cli.main import cli
 from otolith.cli.operation.live_table import FIRST_ANSWER, waiting_text
 from otolith.cli.operation.view import Recordings
+from otolith.health.labels import Numbers
 from otolith.machine import load_machine
 from otolith.storage.history import describe_machine, history_path
-from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.user_dirs import state_directory
 from tests.conftest import EXAMPLES

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from otolith.cli.console import Terminal
 from otolith.cli.main import cli
 from otolith.cli.operation.live_table import LiveTable
+from otolith.health.labels import Numbers
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, HealthDocument, PartDocument, ReportDocument
 from otolith.health.text import event_text, texts_in
 from otolith.publishing.recorder import operator_text, report_text
 from otolith.storage.history import history_path
-from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.storage.histories import MACHINE, SITE, document
 
 POINT = re.compile(r"(?<![\w.,:])\d+\.\d+(?![\d.:])")

@@ -13,8 +13,8 @@ from otolith.publishing.publisher import Publisher
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith.publishing.zenoh_session import StartDocument
+from otolith.runtime.hall.pool import Preparation
 from otolith.runtime.service import Service
-from otolith.runtime.worker import Preparation
 from tests.conftest import EXAMPLES, free_port
 from tests.publishing.test_events import documents
 from tests.waiting import wait_for
@@ -78,7 +78,8 @@ def test_the_service_tells_each_step_once() -> None:
     service, recorded = Service(load_machine(EXAMPLES / "dc-motor-in-process.toml")), Recorded()
     service._publisher = service._notifier = recorded  # type: ignore[assignment]  # has the methods that are used
     for prepared, is_ready in (([], False), ([], False), ([True], False), ([True, True], False), ([True] * 11, True)):
-        service._supervisor._prepared, service._supervisor._is_ready = list(prepared), is_ready
+        (worker,) = service._pool.workers
+        worker.prepared, worker.is_ready = list(prepared), is_ready
         service._show_preparation()
         service._show_preparation()
     assert [document.done for document in recorded.starts] == [0, 1, 2, 11]

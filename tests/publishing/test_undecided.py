@@ -9,6 +9,7 @@ import pytest
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LiveTable
 from otolith.discovery.hypotheses import FaultType
+from otolith.health.labels import Numbers
 from otolith.health.limits import Level
 from otolith.health.schema import (
     AlternativeDocument,
@@ -26,7 +27,7 @@ from otolith.health.text import texts_in
 from otolith.publishing.html_report import html_report
 from otolith.publishing.recorder import operator_text
 from otolith.storage.history import WINDOW
-from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.storage.histories import START, document
 
 

@@ -89,7 +89,7 @@ class Daemons:
     def _started(self) -> Service:
         service = Service(self.machine, clocks=self.computer.read)
         service._start_clock()
-        service._supervisor.state = service._restored(service._supervisor.state)
+        service.machine.state = service._restored(service.machine.state)
         service._start_history()
         service._publisher = self  # type: ignore[assignment]
         return service
@@ -117,9 +117,9 @@ class Daemons:
             start = self.computer.read().monotonic - LENGTH + service._clock.offset
             (window,) = windows(records()[self.window * RECORDS : (self.window + 1) * RECORDS], start)
             self.cut.append(replace(window, index=len(self.cut), ahead=service._clock.ahead))
-            state, report = adapt(service._supervisor.state, self.cut[-1])
-            service._supervisor.state, service._unsaved = state, state
-            service._windows += 1
+            state, report = adapt(service.machine.state, self.cut[-1])
+            service.machine.state, service._unsaved = state, state
+            service.machine.windows += 1
             service._publish(report, 0.1)
             self.window += 1
 
@@ -131,12 +131,12 @@ class Daemons:
 
     def history_of_values(self) -> History:
         """From which the resistance is forecast."""
-        return self.service._supervisor.state.health.histories["R_a"]
+        return self.service.machine.state.health.histories["R_a"]
 
     def stop(self) -> None:
         """Stop the daemon: it saves its state and writes its history."""
         assert self.service._history is not None
-        self.service._store.save(self.service._supervisor.state)
+        self.service._store.save(self.service.machine.state)
         self.service._history.stop(10.0)
         self.service._store.unlock()
 
@@ -293,10 +293,10 @@ def test_a_component_is_forgotten_if_it_was_found_before_the_operator_said_so(
     running = daemons(computer)
     computer.error = 0.0
     running.service._follow_wall_clock()
-    supervisor, found = running.service._supervisor, computer.time
-    supervisor.state = with_component(supervisor.state, running.service._clock.now())
+    machine, found = running.service.machine, computer.time
+    machine.state = with_component(machine.state, running.service._clock.now())
     running.run(1)
-    (key,) = {known.component.key for known in supervisor.state.adopted}
+    (key,) = {known.component.key for known in machine.state.adopted}
     moment = found + 60.0 if is_forgotten else found - 60.0
     running.service._store.operator.write(OperatorDecisions(forgotten={key: moment}))
     running.stop()
@@ -309,7 +309,7 @@ def test_a_component_is_forgotten_if_it_was_found_before_the_operator_said_so(
     assert json.loads(shown[1])["components"][0]["adopted"]["onset"] == pytest.approx(found, abs=LABEL_TOLERANCE)
     computer.time += 120.0
     running.service = running._started()
-    adopted = running.service._supervisor.state.adopted
+    adopted = running.service.machine.state.adopted
     assert [known.component.key for known in adopted] == ([] if is_forgotten else [key])
     running.stop()
 

@@ -43,8 +43,8 @@ class Person:
         return otolith("event", deed, self.running.machine.path, *arguments)
 
     def obeyed(self) -> None:
-        supervisor, store = self.running.service._supervisor, self.running.service._store
-        supervisor.state = self.running.service._decided(supervisor.state, store.decisions())
+        machine, store = self.running.service.machine, self.running.service._store
+        machine.state = self.running.service._decided(machine.state, store.decisions())
 
     @property
     def event(self) -> EventDocument:
@@ -184,7 +184,7 @@ def test_what_the_daemon_has_taken_over_leaves_the_file(begin: Begin) -> None:
     for number in range(3):
         person.does("comment", f"number {number}")
         person.running.run(1)
-        person.running.service._store.save(person.running.service._supervisor.state)
+        person.running.service._store.save(person.running.service.machine.state)
     assert [note.text for note in person.running.service._store.decisions().notes] == ["number 2"]
     assert [note.text for note in person.event.comments or ()] == ["number 0", "number 1", "number 2"]
 

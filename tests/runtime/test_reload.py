@@ -110,11 +110,11 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     path = tmp_path / "motor.toml"
     path.write_text(text, encoding="utf-8")
     service = Service(load_machine(path))
-    store = store_of(service._machine)
+    store = store_of(service._loaded)
     store.operator.write(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
     path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
     service._reload()
-    limited = service._supervisor._next_state().plan.parameters["R_a"]
+    limited = service.machine.next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)
 
@@ -131,23 +131,23 @@ def test_a_baseline_of_other_values_waits_for_a_restart_and_is_a_hint(
     service._started_at = 1.0
     path.write_text(text.replace("[parameters]", '[parameters]\nL_a = "0.2 H"'), encoding="utf-8")
     new = load_machine(path)
-    assert new.problem.known != service._machine.problem.known
-    store = store_of(service._machine)
+    assert new.problem.known != service._loaded.problem.known
+    store = store_of(service._loaded)
     found = Baseline(3.1, 0.01, 50, 1.0, fingerprint_of(new.problem))
     store.operator.write(replace(store.decisions(), baselines={"R_a": found}))
     for _ in range(2):  # a note of a person comes later
-        after = service._decided(service._supervisor.state, store.decisions())
-        assert after.plan.parameters == service._machine.plan.parameters
+        after = service._decided(service.machine.state, store.decisions())
+        assert after.plan.parameters == service._loaded.plan.parameters
     (event,) = service._noted
     assert (event.is_hint, event.change) == (True, EventChange.NOTED)
     assert_says(event.text, "R_a", "restart", str(path))
     assert caplog.text.count(event.text) == 1
     restarted = Service(new)
-    state = restarted._decided(restarted._supervisor.state, store.decisions())
+    state = restarted._decided(restarted.machine.state, store.decisions())
     assert (state.plan.parameters["R_a"].nominal, restarted._noted) == (3.1, ())
     path.write_text(text, encoding="utf-8")
     back = Service(load_machine(path))
-    assert back._decided(back._supervisor.state, store.decisions()).plan.parameters == back._machine.plan.parameters
+    assert back._decided(back.machine.state, store.decisions()).plan.parameters == back._loaded.plan.parameters
     assert_says(back._noted[0].text, "R_a", f"otolith commission {path}")
 
 
@@ -160,7 +160,7 @@ def test_a_command_that_was_found_to_change_unseen_and_is_declared_so_needs_no_a
     text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/').replace('Voltage"', f'Voltage"{declared}')
     path.write_text(text, encoding="utf-8")
     service = Service(load_machine(path))
-    state = service._supervisor.state
+    state = service.machine.state
     learned = with_problem(state, replace(state.problem, changing=("V_a",)))
     monkeypatch.setattr(service._store, "restore", lambda *_: (learned, ""))
     assert service._restored(state).problem.changing == left

@@ -1,4 +1,4 @@
-"""The supervisor: whatever the worker does, every window is answered or counted as missed."""
+"""The pool: whatever a worker does, every window is answered or counted as missed."""
 
 import os
 import signal
@@ -19,27 +19,17 @@ from otolith.cli.main import cli
 from otolith.health.schema import Report
 from otolith.kernel_cache import SOURCE, CompileStep
 from otolith.machine import load_machine
-from otolith.runtime.worker import (
-    COMPILE_TIMEOUT,
-    MAX_WAITING_WINDOWS,
-    NOT_READY,
-    WARM_UP_KERNELS,
-    WINDOW_TIMEOUT,
-    Preparation,
-    Ready,
-    Supervisor,
-    Task,
-    answer,
-    perform,
-)
+from otolith.runtime.hall.machine import MAX_WAITING_WINDOWS, NOT_READY, Task
+from otolith.runtime.hall.pool import COMPILE_TIMEOUT, WINDOW_TIMEOUT, Preparation
+from otolith.runtime.worker import WARM_UP_KERNELS, Ready, answer, perform
 from otolith_drivers.base import Counters, Link, SourceState
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.acquisition.series import uncut
 from tests.conftest import EXAMPLES
 from tests.estimation.test_window_fit import Cut, state_for
+from tests.runtime.pools import LENGTH, OneMachine
 from tests.waiting import PATIENCE, wait_for
 
-LENGTH = 2.0  # s of a window
 BAD = Quality(Verdict.BAD, 0.5, 0.0, 0.0, 0.0)
 
 
@@ -49,19 +39,19 @@ def batch(scenario: MotorScenario, windows: Cut) -> list[Window]:
 
 
 @pytest.fixture
-def supervisor() -> Iterator[Supervisor]:
-    running = Supervisor(state_for("R_a"), length=LENGTH)
-    running.start()
+def pooled() -> Iterator[OneMachine]:
+    running = OneMachine.of(state_for("R_a"))
+    running.pool.start(time.monotonic())
     yield running
-    running.worker.kill()
+    running.pool.kill()
 
 
-def poll_for_report(supervisor: Supervisor) -> Report:
+def poll_for_report(pooled: OneMachine) -> Report:
     """Poll until a report is there, and return it; fail if there are several."""
     reports: list[Report] = []
 
     def has_report() -> bool:
-        reports.extend(report for report, _ in supervisor.poll(time.monotonic()))
+        reports.extend(finished.report for finished in pooled.poll(time.monotonic()))
         return bool(reports)
 
     wait_for(has_report, 3 * PATIENCE)
@@ -69,45 +59,45 @@ def poll_for_report(supervisor: Supervisor) -> Report:
     return reports[0]
 
 
-def poll_until_missed(supervisor: Supervisor, count: int) -> None:
+def poll_until_missed(pooled: OneMachine, count: int) -> None:
     def is_missed() -> bool:
-        supervisor.poll(time.monotonic())
-        return supervisor.missed == count
+        pooled.poll(time.monotonic())
+        return pooled.machine.missed == count
 
     wait_for(is_missed, 3 * PATIENCE)
 
 
-def test_a_window_whose_worker_died_is_tried_again(supervisor: Supervisor, batch: list[Window]) -> None:
-    supervisor.submit(Task(uncut(batch[0])), time.monotonic())
-    poll_for_report(supervisor)
-    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
-    supervisor.worker.kill()
-    assert poll_for_report(supervisor).document.window.index == 1
-    assert (supervisor.missed, supervisor.restarts, supervisor.finished) == (0, 1, 2)
+def test_a_window_whose_worker_died_is_tried_again(pooled: OneMachine, batch: list[Window]) -> None:
+    pooled.submit(Task(uncut(batch[0])), time.monotonic())
+    poll_for_report(pooled)
+    pooled.submit(Task(uncut(batch[1])), time.monotonic())
+    pooled.worker.process.kill()
+    assert poll_for_report(pooled).document.window.index == 1
+    assert (pooled.machine.missed, pooled.pool.restarts, pooled.machine.finished) == (0, 1, 2)
 
 
-def test_a_window_that_kills_two_workers_is_missed(supervisor: Supervisor, batch: list[Window]) -> None:
+def test_a_window_that_kills_two_workers_is_missed(pooled: OneMachine, batch: list[Window]) -> None:
     invalid = replace(batch[0], signals=())  # raises an exception in the worker, which survives
-    supervisor.submit(Task(uncut(invalid)), time.monotonic())
-    poll_until_missed(supervisor, 1)
-    assert supervisor.restarts == 0
-    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
+    pooled.submit(Task(uncut(invalid)), time.monotonic())
+    poll_until_missed(pooled, 1)
+    assert pooled.pool.restarts == 0
+    pooled.submit(Task(uncut(batch[1])), time.monotonic())
     for _ in range(2):
-        supervisor.worker.kill()
-        supervisor.poll(time.monotonic())
-    poll_until_missed(supervisor, 2)
-    supervisor.submit(Task(uncut(batch[2])), time.monotonic())
-    assert poll_for_report(supervisor).document.window.index == 2
+        pooled.worker.process.kill()
+        pooled.poll(time.monotonic())
+    poll_until_missed(pooled, 2)
+    pooled.submit(Task(uncut(batch[2])), time.monotonic())
+    assert poll_for_report(pooled).document.window.index == 2
 
 
-def test_samples_that_cannot_be_cut_cost_their_window_only(supervisor: Supervisor, batch: list[Window]) -> None:
+def test_samples_that_cannot_be_cut_cost_their_window_only(pooled: OneMachine, batch: list[Window]) -> None:
     raw = uncut(batch[0])
     without = replace(raw, samples=replace(raw.samples, series={}))
-    supervisor.submit(Task(without), time.monotonic())
-    poll_until_missed(supervisor, 1)
-    supervisor.submit(Task(uncut(batch[1])), time.monotonic())
-    assert poll_for_report(supervisor).document.window.index == 1
-    assert (supervisor.missed, supervisor.restarts, supervisor.finished) == (1, 0, 1)
+    pooled.submit(Task(without), time.monotonic())
+    poll_until_missed(pooled, 1)
+    pooled.submit(Task(uncut(batch[1])), time.monotonic())
+    assert poll_for_report(pooled).document.window.index == 1
+    assert (pooled.machine.missed, pooled.pool.restarts, pooled.machine.finished) == (1, 0, 1)
 
 
 def test_the_worker_tells_which_sources_and_outputs_failed(batch: list[Window]) -> None:
@@ -118,28 +108,28 @@ def test_the_worker_tells_which_sources_and_outputs_failed(batch: list[Window]) 
     assert result.window is not None
     assert "no answer" in result.window.absent["drive"]
     assert result.window.outages == {"history": "disk full"}
-    supervisor, worker = slow(batch)
+    pooled, worker = slow(batch)
     worker.sent = [replace(result, window=replace(result.window, quality=BAD))]
-    assert len(supervisor.poll(1.0)) == 1
-    assert (supervisor.finished, supervisor.bad) == (1, 1)
+    assert len(pooled.poll(1.0)) == 1
+    assert (pooled.machine.finished, pooled.machine.bad) == (1, 1)
 
 
-def test_a_worker_that_hangs_is_killed(supervisor: Supervisor, batch: list[Window]) -> None:
-    supervisor.submit(Task(uncut(batch[0])), time.monotonic())
-    poll_for_report(supervisor)
-    os.kill(supervisor.worker._process.pid, signal.SIGSTOP)
+def test_a_worker_that_hangs_is_killed(pooled: OneMachine, batch: list[Window]) -> None:
+    pooled.submit(Task(uncut(batch[0])), time.monotonic())
+    poll_for_report(pooled)
+    os.kill(pooled.worker.process._process.pid, signal.SIGSTOP)
     now = time.monotonic()
-    supervisor.submit(Task(uncut(batch[1])), now)
-    supervisor.poll(now + WINDOW_TIMEOUT + 2 * LENGTH + 0.1)
-    assert poll_for_report(supervisor).document.window.index == 1
-    assert supervisor.restarts == 1
+    pooled.submit(Task(uncut(batch[1])), now)
+    pooled.poll(now + WINDOW_TIMEOUT + 2 * LENGTH + 0.1)
+    assert poll_for_report(pooled).document.window.index == 1
+    assert pooled.pool.restarts == 1
 
 
 def test_windows_beyond_the_queue_are_missed(batch: list[Window]) -> None:
-    supervisor = Supervisor(state_for("R_a"), length=LENGTH)
+    pooled = OneMachine.of(state_for("R_a"))
     for window in batch:
-        supervisor.submit(Task(uncut(window)), 0.0)
-    assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
+        pooled.submit(Task(uncut(window)), 0.0)
+    assert pooled.machine.missed == len(batch) - MAX_WAITING_WINDOWS
 
 
 def test_the_worker_is_stateless(batch: list[Window]) -> None:
@@ -184,10 +174,10 @@ def test_the_warm_up_calls_every_kernel_that_windows_need(name: str) -> None:
 def test_windows_missed_during_compilation_are_logged_once(
     batch: list[Window], caplog: pytest.LogCaptureFixture
 ) -> None:
-    supervisor = Supervisor(state_for("R_a"), length=LENGTH)
+    pooled = OneMachine.of(state_for("R_a"))
     for window in batch:
-        supervisor.submit(Task(uncut(window)), 0.0)
-    assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
+        pooled.submit(Task(uncut(window)), 0.0)
+    assert pooled.machine.missed == len(batch) - MAX_WAITING_WINDOWS
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
     assert warnings == [f"window 0 missed: {NOT_READY}"]
 
@@ -218,16 +208,16 @@ class SlowWorker:
         self.killed += 1
 
 
-def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
-    supervisor, worker = Supervisor(state_for("R_a"), length=LENGTH), SlowWorker()
-    supervisor.worker = worker  # type: ignore[assignment]  # has the methods that are used
-    supervisor.submit(Task(uncut(batch[0])), 0.0)
-    return supervisor, worker
+def slow(batch: list[Window]) -> tuple[OneMachine, SlowWorker]:
+    pooled, worker = OneMachine.of(state_for("R_a")), SlowWorker()
+    pooled.worker.process = worker  # type: ignore[assignment]  # has the methods that are used
+    pooled.submit(Task(uncut(batch[0])), 0.0)
+    return pooled, worker
 
 
 def test_how_far_a_worker_is_that_starts_is_known_until_it_is_ready(batch: list[Window]) -> None:
-    supervisor, worker = slow(batch)
-    assert supervisor.preparation == Preparation(0, WARM_UP_KERNELS, False)
+    pooled, worker = slow(batch)
+    assert pooled.pool.preparation == Preparation(0, WARM_UP_KERNELS, False)
     worker.sent = [
         CompileStep(SOURCE, is_end=True, compiled=True),
         CompileStep("first", is_end=False, compiled=False),
@@ -236,14 +226,14 @@ def test_how_far_a_worker_is_that_starts_is_known_until_it_is_ready(batch: list[
         CompileStep("second", is_end=True, compiled=True),
         CompileStep("third", is_end=False, compiled=False),
     ]
-    supervisor.poll(1.0)
-    assert supervisor.preparation == Preparation(2, WARM_UP_KERNELS, True)
+    pooled.poll(1.0)
+    assert pooled.pool.preparation == Preparation(2, WARM_UP_KERNELS, True)
     worker.sent = [Ready()]
-    supervisor.poll(2.0)
-    assert supervisor.preparation is None
+    pooled.poll(2.0)
+    assert pooled.pool.preparation is None
     worker.sent = [CompileStep("rare", is_end=True, compiled=True)]
-    supervisor.poll(3.0)
-    assert supervisor.preparation is None
+    pooled.poll(3.0)
+    assert pooled.pool.preparation is None
 
 
 STEP = COMPILE_TIMEOUT + WINDOW_TIMEOUT  # s; less than a step may take
@@ -251,30 +241,30 @@ STEP = COMPILE_TIMEOUT + WINDOW_TIMEOUT  # s; less than a step may take
 
 def test_a_worker_that_compiles_ten_times_slower_is_not_killed(batch: list[Window]) -> None:
     """Twelve kernels at ten minutes each, before the first window and for a component that is new later."""
-    supervisor, worker = slow(batch)
+    pooled, worker = slow(batch)
     for number in range(1, 13):
         worker.sent = [
             CompileStep("kernel", is_end=True, compiled=True),
             CompileStep("next", is_end=False, compiled=False),
         ]
-        assert supervisor.poll(number * STEP) == []
-        assert (worker.killed, supervisor.progress, supervisor.is_compiling) == (0, number, True)
+        assert pooled.poll(number * STEP) == []
+        assert (worker.killed, pooled.pool.progress, pooled.worker.is_compiling) == (0, number, True)
     worker.sent = [Ready()]
-    supervisor.poll(13 * STEP)
-    assert not supervisor.is_compiling
+    pooled.poll(13 * STEP)
+    assert not pooled.worker.is_compiling
     worker.sent = [CompileStep("rare", is_end=False, compiled=False)]
-    supervisor.poll(13 * STEP + WINDOW_TIMEOUT)
-    supervisor.poll(14 * STEP)
+    pooled.poll(13 * STEP + WINDOW_TIMEOUT)
+    pooled.poll(14 * STEP)
     assert worker.killed == 0
 
 
 def test_a_worker_that_hangs_while_it_compiles_is_killed(batch: list[Window]) -> None:
-    supervisor, worker = slow(batch)
+    pooled, worker = slow(batch)
     worker.sent = [CompileStep("kernel", is_end=False, compiled=False)]
-    supervisor.poll(1.0)
-    supervisor.poll(STEP + 2 * LENGTH + 0.9)
+    pooled.poll(1.0)
+    pooled.poll(STEP + 2 * LENGTH + 0.9)
     assert worker.killed == 0
-    supervisor.poll(STEP + 2 * LENGTH + 1.1)
+    pooled.poll(STEP + 2 * LENGTH + 1.1)
     assert worker.killed == 1
 
 
@@ -283,12 +273,12 @@ def test_a_worker_on_a_busy_computer_is_killed_by_the_processor_time_that_it_tak
     share: float, is_killed: bool, batch: list[Window]
 ) -> None:
     """Three minutes with a ``share`` of a processor, of which the worker gets its turn every 0.5 s."""
-    supervisor, worker = slow(batch)
+    pooled, worker = slow(batch)
     worker.sent = [Ready()]
-    supervisor.poll(0.0)
+    pooled.poll(0.0)
     for tick in range(1, 1801):
         worker.processor_time = 0.5 * share * (tick // 5)
-        supervisor.poll(0.1 * tick)
+        pooled.poll(0.1 * tick)
         if worker.killed:
             break
     assert bool(worker.killed) is is_killed
@@ -298,14 +288,14 @@ def test_a_worker_on_a_busy_computer_is_killed_by_the_processor_time_that_it_tak
 
 def test_kernels_that_are_loaded_are_no_progress(batch: list[Window]) -> None:
     """Otherwise a worker that dies at every start would feed the watchdog for ever."""
-    supervisor, worker = slow(batch)
+    pooled, worker = slow(batch)
     worker.sent = [
         CompileStep("kernel", is_end=False, compiled=False),
         CompileStep("kernel", is_end=True, compiled=False),
         Ready(),
     ]
-    supervisor.poll(1.0)
-    assert supervisor.progress == 0
+    pooled.poll(1.0)
+    assert pooled.pool.progress == 0
 
 
 TANK = """[twin]
@@ -337,15 +327,15 @@ def test_a_first_start_with_an_empty_cache(tmp_path: Path, monkeypatch: pytest.M
     file.write_text('[machine]\nname = "t"\nsite = "s"\n[twin]\nfile = "tank.toml"\n', encoding="utf-8")
     machine = load_machine(file, with_driver=False)
     state = initial_state("t", "s", machine.problem, machine.plan)
-    supervisor = Supervisor(state, LENGTH)
-    supervisor.start()
+    pooled = OneMachine.of(state)
+    pooled.pool.start(time.monotonic())
     values = np.random.default_rng(1).uniform(0.4, 0.6, (200, 2))
-    supervisor.submit(Task(uncut(Window.whole(0, 0.0, 0.01, machine.twin.signals, values))), time.monotonic())
+    pooled.submit(Task(uncut(Window.whole(0, 0.0, 0.01, machine.twin.signals, values))), time.monotonic())
     try:
-        wait_for(lambda: bool(supervisor.poll(time.monotonic())) or supervisor.missed > 0, 3 * PATIENCE)
+        wait_for(lambda: bool(pooled.poll(time.monotonic())) or pooled.machine.missed > 0, 3 * PATIENCE)
     finally:
-        supervisor.worker.kill()
-    assert (supervisor.restarts, supervisor.missed, supervisor.finished) == (0, 0, 1)
-    assert supervisor.progress > 5  # kernels, then the window
+        pooled.worker.process.kill()
+    assert (pooled.pool.restarts, pooled.machine.missed, pooled.machine.finished) == (0, 0, 1)
+    assert pooled.pool.progress > 5  # kernels, then the window
     result = CliRunner().invoke(cli, ["compile", str(file)])
     assert (result.exit_code, result.output) == (0, f"all kernels are there: {tmp_path}/cache/otolith/kernels\n")

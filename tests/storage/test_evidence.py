@@ -29,7 +29,7 @@ from otolith.cli.main import cli
 from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, diagnose
 from otolith.health.schema import EventChange, FindingKind, Report
 from otolith.machine import load_machine
-from otolith.runtime.worker import Supervisor, Task
+from otolith.runtime.hall.machine import Task
 from otolith.storage import evidence
 from otolith.storage.evidence import (
     EVIDENCE,
@@ -49,6 +49,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.acquisition.series import uncut
 from tests.conftest import EXAMPLES, SIGNALS
+from tests.runtime.pools import OneMachine
 from tests.storage.histories import event
 from tests.waiting import PATIENCE, wait_for
 
@@ -96,14 +97,21 @@ def bundles(batch: list[Window], tmp_path_factory: pytest.TempPathFactory) -> li
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         patch.setattr(evidence, "MIN_WINDOWS", 2)
         kept = writer(tmp_path_factory.mktemp("evidence"))
-        supervisor = Supervisor(fresh(), RECORDS * PERIOD, kept.add)
-        supervisor.start()
+        pooled = OneMachine.of(fresh())
+        pooled.pool.start(time.monotonic())
+
+        def is_kept() -> bool:
+            finished = pooled.poll(time.monotonic())
+            for item in finished:
+                kept.add(item.before, item.window, item.report, item.after)
+            return bool(finished)
+
         try:
             for window in batch:
-                supervisor.submit(Task(uncut(window)), time.monotonic())
-                wait_for(lambda: bool(supervisor.poll(time.monotonic())), 3 * PATIENCE)
+                pooled.submit(Task(uncut(window)), time.monotonic())
+                wait_for(is_kept, 3 * PATIENCE)
         finally:
-            supervisor.worker.kill()
+            pooled.pool.kill()
         kept.write()
     assert kept.dropped == 0
     return sorted(kept.folder.glob("*.zip"))

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from otolith.health.labels import Numbers
 from otolith.health.limits import Level
 from otolith.health.schema import HealthDocument, PartDocument, ReportDocument
 from otolith.machine import load_machine
@@ -32,7 +33,7 @@ from otolith.storage.history import (
     describe_machine,
 )
 from otolith.storage.history_schema import create
-from otolith.storage.history_writer import AGES, BATCH, MAX_WAITING, Bounds, HistoryWriter, Numbers
+from otolith.storage.history_writer import AGES, BATCH, MAX_WAITING, Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, START, document, documents

@@ -185,8 +185,8 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     monkeypatch.setattr(service._writer, "save", requested.append)
     service._save(1e6)
     assert requested == []  # before the first window
-    service._supervisor.finished += 1
-    state = service._supervisor.state
+    service.machine.finished += 1
+    state = service.machine.state
     before = state.previous["R_a"]
     refuted = type(before)(known=True, status=Status.INVALID)
     state.previous["R_a"] = refuted
@@ -199,7 +199,7 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     service._save(1e6 + 61.0)
     assert requested == [state, state]
     service._save(1e6 + 62.0)
-    service._supervisor.state = replace(state, previous={**state.previous, "R_a": refuted})
+    service.machine.state = replace(state, previous={**state.previous, "R_a": refuted})
     service._save(math.inf)  # at the end: the last state that nothing contradicts
     assert requested == [state, state, state]
     service._save(math.inf)
@@ -209,7 +209,7 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
 def test_an_event_is_saved_at_once(healthy: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
     service, requested = Service(load_machine(healthy.machine)), list[object]()
     monkeypatch.setattr(service._writer, "save", requested.append)
-    service._supervisor.finished += 1
+    service.machine.finished += 1
     service._save(1e6)
     quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
     window = WindowDocument(index=3, start=0.0, end=2.0, records=200, quality=quality)
@@ -219,7 +219,7 @@ def test_an_event_is_saved_at_once(healthy: OwnMachine, monkeypatch: pytest.Monk
             evidence=EvidenceDocument(windows=(window.index, window.index)),
         )  # fmt: skip
         health = HealthState(records={"limit/R_a": ConditionRecord(state, ((state, window),), event)})
-        service._supervisor.state = replace(service._supervisor.state, health=health)
+        service.machine.state = replace(service.machine.state, health=health)
         service._save(1e6 + 1.0)
         service._save(1e6 + 2.0)
     assert len(requested) == 3

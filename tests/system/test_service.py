@@ -21,8 +21,8 @@ from otolith.estimation.problem import Component
 from otolith.health.schema import Status
 from otolith.machine import RecordedMachine, find_twin, load_machine
 from otolith.publishing import recorder
-from otolith.runtime.service import STALL_TIMEOUT, Service
-from otolith.runtime.worker import COMPILE_TIMEOUT
+from otolith.runtime.hall.pool import COMPILE_TIMEOUT, STALL_TIMEOUT
+from otolith.runtime.service import Service
 from otolith.storage.state_store import StateStore
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ServiceError
@@ -124,7 +124,8 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
             except BlockingIOError:
                 return False
 
-        service._stall.begin(1000.0, 0.0)
+        (worker,) = service._pool.workers
+        worker.stall.begin(1000.0, 0.0)
         service._feed_watchdog(1002.0)
         assert fed()
         patience = STALL_TIMEOUT + 3 * 2.0 + COMPILE_TIMEOUT
@@ -132,16 +133,16 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         assert fed()
         service._feed_watchdog(1000.0 + patience + 0.1)
         assert not fed()
-        service._supervisor.missed += 1
+        service.machine.missed += 1
         service._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        service._supervisor.progress += 1  # a kernel is compiled: time for the next one
+        service._pool._compiled += 1  # a kernel is compiled: time for the next one
         service._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
         service._feed_watchdog(1000.0 + 2 * patience + 5.9)
         assert fed()
-        service._supervisor.progress += 1  # a window is finished
-        service._supervisor.is_compiling = False
+        service.machine.finished += 1  # a window is finished
+        worker.is_compiling = False
         service._feed_watchdog(1000.0 + 2 * patience + 8.0)
         assert fed()
         service._feed_watchdog(1000.0 + 2 * patience + 8.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)

@@ -2,6 +2,7 @@
 
 The core computes with *service time*, which only elapses: it never leaps, whatever sets the clock. A report leaves the
 daemon with Unix times. If the clock turns out to have been wrong, the labels change, and service times stay.
+:class:`Numbers` gives a report its sequence numbers, which rise whatever the clock says.
 """
 
 from bisect import bisect_right
@@ -29,6 +30,7 @@ from otolith_drivers.config_files import DocumentModel
 CERTIFICATE, BASELINE = "certificate", "baseline"
 
 # Thresholds: docs/reference/thresholds-health.md has the origin of each.
+NUMBER_LEAP = 4000  # numbers skipped at a start: more than a daemon publishes without saving
 MAX_SPANS = 200  # of different labels; of more, the two neighbours that differ least become one
 
 Document = TypeVar("Document", bound=DocumentModel)
@@ -179,3 +181,31 @@ def _noted(key: str, time: float, text: str, evidence: EvidenceDocument, languag
         start=time, since=time, end=time, condition=text, condition_id=key, text=text, language=language,
         evidence=evidence,
     )  # fmt: skip
+
+
+class Numbers:
+    """The sequence numbers of a machine: they rise, also over restarts, whatever was not saved before."""
+
+    def __init__(self, now: float, report: int | None = None, event: int | None = None, start: int = 0) -> None:
+        """``report`` and ``event`` are the newest numbers in the history, ``start`` where the last daemon began.
+
+        A daemon that was killed may have published numbers that are not in the history, or the history may be lost. So
+        the first number is that of the Unix time ``now`` in ms, and far above the numbers in the history.
+        """
+        self._report, self._event = report, event
+        self.start = max(max(report or 0, event or 0, start) + NUMBER_LEAP, int(now * 1e3))
+        self._next = self.start
+
+    def number(self, document: ReportDocument) -> ReportDocument:
+        """Return the report with its sequence numbers, and those of the events that it changed."""
+        numbers, self._report = {"sequence": self._take(), "previous": self._report}, self._next - 1
+        events = tuple(event if event.change is None else self._numbered(event) for event in document.events)
+        return document.model_copy(update={**numbers, "events": events})
+
+    def _numbered(self, event: EventDocument) -> EventDocument:
+        numbers, self._event = {"sequence": self._take(), "previous": self._event}, self._next - 1
+        return event.model_copy(update=numbers)
+
+    def _take(self) -> int:
+        self._next += 1
+        return self._next - 1

@@ -22,19 +22,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from otolith.acquisition.ring import Rings
-from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import (
     AdaptationState,
     OperatorDecisions,
     apply_decisions,
-    initial_state,
     with_problem,
-    with_sample_grid,
 )
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
-from otolith.health.labels import baseline_event, clock_event, expiry_event
+from otolith.health.labels import Numbers, baseline_event, clock_event, expiry_event
 from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
 from otolith.health.status import driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
@@ -44,13 +40,13 @@ from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import StartDocument, protect_files
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
-from otolith.runtime.effort import Effort
+from otolith.runtime.hall.machine import MAX_WAIT, Machine, Task
+from otolith.runtime.hall.pool import Pool, Preparation
 from otolith.runtime.process import SIGNALS, EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.runtime.worker import COMPILE_TIMEOUT, Preparation, Supervisor, Task
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
-from otolith.storage.history_writer import Numbers, history_of
+from otolith.storage.history_writer import history_of
 from otolith.storage.state_store import LockedError, StateWriter, store_of
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import OtolithError, ServiceError
@@ -59,14 +55,8 @@ from otolith_drivers.outside_text import visible
 log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-RING_WINDOWS = 8  # windows that the rings hold: how long the main thread may be delayed without loss of samples
-RING_RATE = 4  # times the grid's rate at which a source may send for that to hold
-MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process and an outage
-MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
-STALL_TIMEOUT = 30.0  # s of effort without a finished window, and three window lengths; then no watchdog is fed
-MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
 MAX_STATUS = 1000  # characters of a line for systemd, beyond which it is cut: a datagram that is too long is not sent
@@ -180,12 +170,9 @@ class Service:
 
         ``clocks`` reads the clocks of the computer.
         """
-        file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
-        self._machine = machine
+        file = machine.file
+        self._loaded, self.machine = machine, Machine.of(machine)
         self._listen = file.zenoh.listen if listen is None else listen
-        plans = machine.plans(machine.driver.sampling)
-        self._rings = _rings(machine, max(plan.delay for plan in plans))
-        self._windower = Windower(plans, machine.records, period, machine.limits)
         self._store = store_of(machine)
         self._writer = StateWriter(self._store, self._store.operator.time())
         self._history = history_of(file)
@@ -193,15 +180,13 @@ class Service:
         self._read_clocks, self._clock = clocks, ServiceClock(read=clocks)
         self._noted: tuple[EventDocument, ...] = ()  # events that the next report has
         self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
-        self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._waiting: tuple[str, ...] = ()  # Parameters whose baselines were found with other values
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
         self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
         self._described: MonitoringPlan | None = None  # by the history
-        state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
-        self._supervisor = Supervisor(state, longest * period, self._evidence.add)
+        self._pool = Pool([self.machine])
         self._recorder = RecorderSupervisor(machine, recording)
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
@@ -209,9 +194,7 @@ class Service:
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
         self._is_reload_due = False
-        self._windows = self._progress = 0
         self._started_at = self._fed_at = 0.0
-        self._stall = Effort()  # of the worker since its last progress
         self._summarised_at = -math.inf
         self._logged: ReportDocument | None = None  # The last report with a line in the log
 
@@ -254,22 +237,21 @@ class Service:
         except ServiceError as error:  # what is learned may be lost, but the machine is monitored
             self._writer.fail(error)
         self._start_clock()
-        self._supervisor.state = self._restored(self._supervisor.state)
+        self.machine.state = self._restored(self.machine.state)
         self._start_history()
-        self._windower.records = self._supervisor.records
-        identity, driver = self._machine.file.machine, self._machine.driver
-        access = Access(self._machine.file.zenoh, self._machine.path)
+        identity, driver = self._loaded.file.machine, self._loaded.driver
+        access = Access(self._loaded.file.zenoh, self._loaded.path)
         self._publisher = Publisher(identity.site, identity.name, self._listen, access, self._history)
-        driver.open(self._rings.deliver)
+        driver.open(self.machine.rings.deliver)
         self._writer.start()
         self._evidence.start()
-        self._supervisor.start()
+        self._pool.start(time.monotonic())
         if self._recorder.is_enabled:
             self._recorder.start(time.monotonic())
         self._started_at = time.monotonic()
-        self._stall.begin(self._started_at, self._supervisor.worker.processor_time)
+        self.machine.begin(self._started_at)
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
-        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, self._publisher.endpoints)
+        log.info("machine %s, %s: reports on %s", identity.name, self._loaded.twin.title, self._publisher.endpoints)
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""
@@ -284,8 +266,8 @@ class Service:
             steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._evidence.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
-            steps.callback(self._supervisor.worker.kill)
-            steps.callback(self._machine.driver.close)
+            steps.callback(self._pool.kill)
+            steps.callback(self._loaded.driver.close)
             self._save(math.inf)
             self._notifier.send("STOPPING=1")
 
@@ -301,7 +283,7 @@ class Service:
     def _restored(self, state: AdaptationState) -> AdaptationState:
         """Return ``state`` with what was saved and decided; an unreadable file must not prevent monitoring."""
         state, note = self._store.restore(state)
-        polled = {name for name, plan in self._windower.plans.items() if plan.sampling is Sampling.POLLED}
+        polled = {name for name, plan in self.machine.windower.plans.items() if plan.sampling is Sampling.POLLED}
         changing = tuple(name for name in state.problem.changing if name not in polled)  # without those declared since
         state = with_problem(state, replace(state.problem, changing=changing))
         notes = [note] if note else []
@@ -315,7 +297,7 @@ class Service:
         if math.isfinite(end := state.posterior.belief.end):
             log.info(
                 "started with what was learned up to %s",
-                moment_text(self._clock.labels.unix(end), self._machine.plan.timezone),
+                moment_text(self._clock.labels.unix(end), self._loaded.plan.timezone),
             )
         if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
@@ -335,50 +317,50 @@ class Service:
         if not set(names) - set(before):
             return
         key = "baseline_waits" if self._started_at else "baseline_is_of_other_values"
-        language, file = self._machine.file.machine.language, str(self._machine.path)
-        text = self._machine.plan.texts(key, names=", ".join(names), file=file)
+        language, file = self._loaded.file.machine.language, str(self._loaded.path)
+        text = self._loaded.plan.texts(key, names=", ".join(names), file=file)
         log.warning("%s", text)
-        self._noted = (*self._noted, baseline_event(self._clock.now(), text, self._windows, language))
+        self._noted = (*self._noted, baseline_event(self._clock.now(), text, self.machine.windows, language))
 
     def _start_history(self) -> None:
+        self.machine.numbers = Numbers(time.time())
         if self._history is not None:
-            self._numbers, note = self._history.open(max(self._clock.now(), time.time()))
+            self.machine.numbers, note = self._history.open(max(self._clock.now(), time.time()))
             self._notes += (note,) if note else ()
-            state, reason = self._supervisor.state, "its state was not saved before the daemon ended"
+            state, reason = self.machine.state, "its state was not saved before the daemon ended"
             health = state.health.agreeing(self._history.last_changes(), reason)
-            self._supervisor.state = replace(state, health=health)
+            self.machine.state = replace(state, health=health)
             self._history.start()
 
     def _reload(self) -> None:
         """Take over limits, rules, recording and access from the machine file; if it is invalid, go on as before."""
         self._is_reload_due = False
         try:
-            change = reloaded(self._machine, load_machine(self._machine.path))
+            change = reloaded(self._loaded, load_machine(self._loaded.path))
             files = self._evidence.files if change.needs_restart else files_of(change.machine)
             decisions = self._store.decisions()
         except (OtolithError, OSError) as error:
             log.warning("not reloaded, the daemon goes on as before: %s", "; ".join(str(error).split("\n")))
             return
-        self._machine, self._evidence.files = change.machine, files
+        self._loaded, self._evidence.files = change.machine, files
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             # The decisions contain the baselines to which limits in percent refer.
-            self._supervisor.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
+            self.machine.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
         if self._publisher is not None:  # also if the files have the same names as before
-            self._publisher.reload(Access(self._machine.file.zenoh, self._machine.path))
+            self._publisher.reload(Access(self._loaded.file.zenoh, self._loaded.path))
         if change.recording:
-            self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
+            self._recorder.reload(self._loaded, time.monotonic(), RECORDER_FLUSH)
 
     def _step(self) -> None:
         """Hand the samples of due windows to the worker, publish finished reports, supervise the processes."""
         now = time.monotonic()
-        begun = self._windower.begin(self._rings, now, now - self._started_at)
-        while begun and self._windower.due(self._rings, now):
+        while (due := self.machine.due_at(now)) <= now:
             self._take(now)
-        wait(self._supervisor.worker.waitables, timeout=min(MAX_WAIT, max(MIN_WAIT, self._windower.next_end - now)))
-        for report, seconds in self._supervisor.poll(time.monotonic()):
-            self._publish(report, seconds)
-            self._windower.records = self._supervisor.records
+        wait(self._pool.waitables, timeout=min(MAX_WAIT, due - now))
+        for _, finished in self._pool.poll(time.monotonic()):
+            self._evidence.add(finished.before, finished.window, finished.report, finished.after)
+            self._publish(finished.report, finished.seconds)
             self._save(time.monotonic())
         self._show_preparation()
         self._feed_watchdog(time.monotonic())
@@ -387,13 +369,13 @@ class Service:
 
     def _show_preparation(self) -> None:
         """Tell readers and systemd how many kernels a worker has that is not ready: until then there is no report."""
-        if (now := self._supervisor.preparation) == self._preparation:
+        if (now := self._pool.preparation) == self._preparation:
             return
         before, self._preparation = self._preparation, now
         shown = now or before
         if shown is None or self._publisher is None:
             return
-        identity, done = self._machine.file.machine, shown.total if now is None else shown.done
+        identity, done = self._loaded.file.machine, shown.total if now is None else shown.done
         self._notifier.send(f"STATUS={shown.text if now else 'the first window is computed'}")
         self._publisher.publish_start(
             StartDocument(site=identity.site, machine=identity.name, done=done, total=shown.total, text=shown.text)
@@ -401,15 +383,14 @@ class Service:
 
     def _take(self, now: float) -> None:
         self._follow_wall_clock()
-        raw = self._windower.take(self._rings, self._clock.offset, self._clock.ahead)
-        link = self._machine.driver.link()
-        self._windower.latency = link.latency
-        self._adopt_achieved_period(link.period)
+        link = self._loaded.driver.link()
+        raw = self.machine.take(link, self._clock.offset, self._clock.ahead)
+        window, period = self._loaded.problem.window, self._loaded.file.window.sample_period
+        self.machine.adopt_period(link.period, window, period)
         decisions = self._writer.new_decisions()
         if decisions is not None:
-            self._supervisor.revise(lambda state: self._decided(state, decisions))
-        self._windows += 1
-        self._supervisor.submit(Task(raw, link, self._outages(now)), now)
+            self.machine.revise(lambda state: self._decided(state, decisions))
+        self._pool.submit(self.machine, Task(raw, link, self._outages(now)), now)
 
     def _outages(self, now: float) -> dict[str, str]:
         """Return the outputs that have failed for ``OUTAGE_AFTER``, and why; the machine is monitored without them."""
@@ -430,32 +411,20 @@ class Service:
         self._store.clock = self._clock.saved
         if by is not None:
             self._saved_at = -math.inf
-            event = clock_event(self._clock.now(), by, self._windows, self._machine.file.machine.language)
+            event = clock_event(self._clock.now(), by, self.machine.windows, self._loaded.file.machine.language)
             self._noted = (*self._noted, event)
-
-    def _adopt_achieved_period(self, period: float | None) -> None:
-        """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
-        current = self._windower.sample_period
-        if period is None or abs(period / current - 1.0) < MIN_PERIOD_CHANGE:
-            return
-        configured, ratio = self._machine.problem.window, period / self._machine.file.window.sample_period
-        self._supervisor.revise(lambda state: with_sample_grid(state, configured, ratio))
-        self._windower.regrid(self._supervisor.records, period)
-        change = f"the machine gives a sample every {period * 1e3:.4g} ms instead of every {current * 1e3:.4g} ms"
-        size = f"{self._windower.records} records in {self._windower.length:.4g} s"
-        log.warning("%s: windows now have %s", change, size)
 
     def _publish(self, report: Report, seconds: float) -> None:
         document, noted = report.document, self._noted
         self._noted, warning = (), "" if self._publisher is None else self._publisher.warning(datetime.now(UTC))
         latency = max(0.0, self._clock.now() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
-        driver = driver_document(self._machine.driver.link())
+        driver = driver_document(self._loaded.driver.link())
         parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         update["events"] = (*noted, *document.events)
         update["notes"] = (*self._notes, *filter(None, [warning]))
-        document = self._numbers.number(document.model_copy(update=update))
+        document = self.machine.numbers.number(document.model_copy(update=update))
         if self._history is not None:
             self._describe()
             self._history.labels = self._clock.labels
@@ -469,23 +438,23 @@ class Service:
 
     def _describe(self) -> None:
         """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
-        plan = self._supervisor.state.plan
+        plan = self.machine.state.plan
         if self._history is not None and plan != self._described:
-            machine = self._machine
+            machine = self._loaded
             text = describe_machine(machine.twin, plan, None, machine.path, dict(machine.problem.known))
             self._history.description, self._described = text, plan
 
     def _counters(self) -> CountersDocument:
-        rings, driver = self._rings.counters(), self._machine.driver.counters()
+        rings, driver = self.machine.rings.counters(), self._loaded.driver.counters()
         return CountersDocument(
             received=rings.received,
             bad=driver.bad,
             lost=driver.lost + rings.overwritten,
             reconnects=driver.reconnects,
-            windows=self._windows,
-            windows_bad=self._supervisor.bad,
-            windows_missed=self._supervisor.missed,
-            worker_restarts=self._supervisor.restarts,
+            windows=self.machine.windows,
+            windows_bad=self.machine.bad,
+            windows_missed=self.machine.missed,
+            worker_restarts=self._pool.restarts,
             recordings_dropped=self._recorder.dropped,
             recorder_restarts=self._recorder.restarts,
             history_dropped=0 if self._history is None else self._history.dropped,
@@ -515,8 +484,8 @@ class Service:
         """Log that the certificate of an endpoint expires soon, and note it in the next report."""
         publisher.warn_of_expiry(now)
         if (notice := publisher.expiry_notice(now)) is not None and notice.end is not None:
-            name, language = str(notice.certificate), self._machine.file.machine.language
-            event = expiry_event(self._clock.now(), name, notice.end.timestamp(), self._windows, language)
+            name, language = str(notice.certificate), self._loaded.file.machine.language
+            event = expiry_event(self._clock.now(), name, notice.end.timestamp(), self.machine.windows, language)
             self._noted = (*self._noted, event)
 
     def _save(self, now: float) -> None:
@@ -524,8 +493,8 @@ class Service:
 
         A state that windows contradict is not saved: it might not be restored as what it was. The one before it is.
         """
-        if self._supervisor.finished and self._supervisor.state.is_valid:
-            self._unsaved = self._supervisor.state
+        if self.machine.finished and self.machine.state.is_valid:
+            self._unsaved = self.machine.state
         if self._unsaved is None:
             return
         keys = _keys(self._unsaved)
@@ -535,21 +504,10 @@ class Service:
 
     def _feed_watchdog(self, now: float) -> None:
         """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
-        spent = self._supervisor.worker.processor_time
-        if self._supervisor.progress != self._progress:
-            self._progress = self._supervisor.progress
-            self._stall.begin(now, spent)
-        compiling = COMPILE_TIMEOUT if self._supervisor.is_compiling else 0.0
-        stalled = self._stall.seconds(now, spent) > STALL_TIMEOUT + 3 * self._windower.length + compiling
+        stalled = self._pool.is_stalled(now)
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now
             self._notifier.send("WATCHDOG=1")
-
-
-def _rings(machine: LoadedMachine, delay: float) -> Rings:
-    """Return rings that hold ``RING_WINDOWS`` of the longest windows, and the longest ``delay`` of a signal (s)."""
-    records = RING_WINDOWS * machine.problem.window.longest + math.ceil(delay / machine.file.window.sample_period)
-    return Rings(machine.twin.signals, RING_RATE * records, machine.observed)
 
 
 def _keys(state: AdaptationState) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from otolith.health.labels import TimeLabels
+from otolith.health.labels import Numbers, TimeLabels
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
 from otolith.storage.disk import WriterThread, give_to, opened_folder
@@ -42,7 +42,6 @@ log = logging.getLogger(__name__)
 DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 """Primary codes of a database that cannot be used as it is; most others are faults of disk and permissions."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
-NUMBER_LEAP = 4000  # numbers skipped at a start: more than a daemon publishes without saving
 MAX_WAITING = 256  # reports that wait for the disk
 BATCH = 64  # reports in one transaction, and from which on their values are written
 MERGE_INTERVAL = 60.0  # s from the first report to the transaction with its values
@@ -179,34 +178,6 @@ class Retention:
             # Not by execute, which would stop after the first page.
             self._connection.executescript(f"PRAGMA incremental_vacuum({PAGES_AT_ONCE})")
         self._limit()
-
-
-class Numbers:
-    """The sequence numbers of a machine: they rise, also over restarts, whatever was not saved before."""
-
-    def __init__(self, now: float, report: int | None = None, event: int | None = None, start: int = 0) -> None:
-        """``report`` and ``event`` are the newest numbers in the history, ``start`` where the last daemon began.
-
-        A daemon that was killed may have published numbers that are not in the history, or the history may be lost. So
-        the first number is that of the Unix time ``now`` in ms, and far above the numbers in the history.
-        """
-        self._report, self._event = report, event
-        self.start = max(max(report or 0, event or 0, start) + NUMBER_LEAP, int(now * 1e3))
-        self._next = self.start
-
-    def number(self, document: ReportDocument) -> ReportDocument:
-        """Return the report with its sequence numbers, and those of the events that it changed."""
-        numbers, self._report = {"sequence": self._take(), "previous": self._report}, self._next - 1
-        events = tuple(event if event.change is None else self._numbered(event) for event in document.events)
-        return document.model_copy(update={**numbers, "events": events})
-
-    def _numbered(self, event: EventDocument) -> EventDocument:
-        numbers, self._event = {"sequence": self._take(), "previous": self._event}, self._next - 1
-        return event.model_copy(update=numbers)
-
-    def _take(self) -> int:
-        self._next += 1
-        return self._next - 1
 
 
 class HistoryWriter(WriterThread):

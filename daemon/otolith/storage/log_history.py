@@ -9,10 +9,11 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from otolith.health.labels import Numbers
 from otolith.health.schema import ReportDocument
 from otolith.storage.history import HistoryReader, Tables, path_in
 from otolith.storage.history_schema import create
-from otolith.storage.history_writer import BATCH, Numbers
+from otolith.storage.history_writer import BATCH
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import writable
 

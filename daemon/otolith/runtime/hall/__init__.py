@@ -1,0 +1,1 @@
+"""The machines of a service and the processes that compute for all of them."""
