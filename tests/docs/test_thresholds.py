@@ -29,7 +29,7 @@ SOURCES = {
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
     "runtime": [DAEMON / "runtime", DAEMON / "runtime" / "hall", DAEMON / "publishing", DAEMON],
-    "site": [DAEMON / "site"],
+    "site": [DAEMON / "site", DAEMON / "site" / "outlets"],
     "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin"],

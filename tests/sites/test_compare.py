@@ -2,8 +2,10 @@
 
 import pytest
 
+from otolith.acquisition.window import Verdict
 from otolith.health.limits import Level
-from otolith.site.compare import MIN_SISTERS, WEEK, sisters, week
+from otolith.health.schema import DriverDocument
+from otolith.site.compare import MIN_SISTERS, WEEK, poor_data, sisters, week
 from otolith.site.known import Knowledge
 from tests.sites.machines import raised, report_of, sent
 from tests.storage.histories import START
@@ -48,3 +50,18 @@ def test_the_events_of_a_week_are_the_newest_first_without_hints_and_older_ones(
     rows = week(knowledge, START, "en", "UTC")
     assert [row.state for row in rows] == ["OK", "OK", "ACT"]
     assert [row.time[:10] for row in rows] == ["2023-11-13", "2023-11-11", "2023-10-15"]
+
+
+def test_a_machine_of_incomplete_data_is_named_with_its_reason() -> None:
+    knowledge = known(6.5, 6.5, 6.5)
+    window = report_of().window
+    bad = window.quality.model_copy(update={"verdict": Verdict.BAD, "missing": 0.4, "reasons": ("omega: 40% missing",)})
+    own = {"window": window.model_copy(update={"quality": bad})}
+    knowledge.take(*sent(report_of("m-1", 2).model_copy(update=own)), START)
+    down = {"driver": DriverDocument(up=False, reason="no frame for 5 s")}
+    knowledge.take(*sent(report_of("m-2", 2).model_copy(update=down)), START)
+    rows = poor_data(knowledge, START, "en")
+    assert [(row.machine.name, row.missing, row.reason) for row in rows] == [
+        ("m-1", "40%", "omega: 40% missing"), ("m-2", "0%", "no frame for 5 s"),
+    ]  # fmt: skip
+    assert poor_data(knowledge, START + 3600.0, "en") == []  # silent: nothing is known of its data

@@ -39,7 +39,7 @@ def test_a_mistake_is_named_with_its_key_and_remedy(tmp_path: Path, text: str, n
 def test_an_empty_file_is_a_site_for_this_computer_only(tmp_path: Path) -> None:
     file = tmp_path / "site.toml"
     file.touch()
-    settings = load_site(file)
+    settings, _ = load_site(file)
     assert settings.http.address == ("127.0.0.1", 8420)
     assert settings.connection(tmp_path).endpoints == ()
 
@@ -47,7 +47,7 @@ def test_an_empty_file_is_a_site_for_this_computer_only(tmp_path: Path) -> None:
 def test_files_are_relative_to_that_of_the_site(tmp_path: Path) -> None:
     file = tmp_path / "site.toml"
     file.write_text('[zenoh]\nca = "keys/ca.crt"\nlogin = "/etc/login"', encoding="utf-8")
-    credentials = load_site(file).connection(tmp_path).credentials
+    credentials = load_site(file)[0].connection(tmp_path).credentials
     assert credentials.ca == tmp_path / "keys" / "ca.crt"
     assert credentials.login == Path("/etc/login")
 

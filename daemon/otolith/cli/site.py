@@ -32,12 +32,16 @@ def site(file: Path | None, verbose: bool) -> int:
     if lacking := [name for name in EXTRA if importlib.util.find_spec(name) is None]:
         raise ServiceError(f"{', '.join(lacking)} is missing: {installation_of('site')}")
     from otolith.site.collector import Collector
+    from otolith.site.outlets.base import OutletSetup
+    from otolith.site.outlets.table import runners_of
     from otolith.site.server import run_site
     from otolith.site.settings import SiteFile, load_site
 
     log_to_stderr(verbose=verbose)
-    settings = SiteFile() if file is None else load_site(file)
+    settings, source = (SiteFile(), None) if file is None else load_site(file)
     folder = Path() if file is None else file.parent.absolute()
     collector = Collector(settings.connection(folder), settings.machines)
-    ended_by = run_site(collector, settings, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
+    setup = OutletSetup(folder, settings.title, settings.language or "en")
+    outlets = runners_of(settings.outlets, setup, collector, source)
+    ended_by = run_site(collector, settings, outlets, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
     return INTERRUPTED if ended_by == signal.SIGINT else 0

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from importlib.resources import files
@@ -20,9 +20,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from otolith.health.schema import LANGUAGES, Language
 from otolith.publishing.received_history import received_page
 from otolith.site.collector import Collector
-from otolith.site.compare import sisters, week
+from otolith.site.compare import poor_data, sisters, week
 from otolith.site.hall import PAGES, Filter, Hall
 from otolith.site.metrics import CONTENT_TYPE, exposition
+from otolith.site.outlets.runner import OutletStatus
 from otolith.site.past import SPANS, PastQuery, past_of
 from otolith.site.settings import OWN_HOSTS, SiteFile
 from otolith.site.words import accepted, words_in
@@ -33,6 +34,7 @@ TICK = 1.0  # s between two looks for what has changed
 SEND_TIMEOUT = 10.0  # s that a slow reader may take for one event
 MAX_LOOKING = 4  # pages of the past of machines that are made at a time
 MAX_QUERY = 512  # characters of the query of an address
+FIRST_SISTERS = 8  # machines of a parameter that are seen at once, with those that differ
 STATIC = {"site.css": "text/css", "site.js": "text/javascript"}
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -101,8 +103,8 @@ def host_named(header: str) -> str:
 class SitePages:
     """The handlers of all addresses."""
 
-    def __init__(self, collector: Collector, settings: SiteFile) -> None:
-        self._collector, self._settings = collector, settings
+    def __init__(self, collector: Collector, settings: SiteFile, outlets: Sequence[OutletStatus] = ()) -> None:
+        self._collector, self._settings, self._outlets = collector, settings, outlets
         self._hall = Hall(collector.knowledge, settings.timezone)
         self._live = asyncio.Semaphore(MAX_LIVE)
         self._looking = asyncio.Semaphore(MAX_LOOKING)
@@ -146,9 +148,11 @@ class SitePages:
         language, now = self._language(request), time.time()
         knowledge = self._collector.knowledge
         with self._collector.lock:
-            own = {"sisters": sisters(knowledge, now, language),
+            own = {"sisters": sisters(knowledge, now, language), "poor": poor_data(knowledge, now, language),
                    "events": week(knowledge, now, language, self._settings.timezone)}  # fmt: skip
-        return HTMLResponse(PAGES.get_template("compare.html").render(own | self._frame(language, "compare")))
+        return HTMLResponse(
+            PAGES.get_template("compare.html").render(own, first=FIRST_SISTERS, **self._frame(language, "compare"))
+        )
 
     async def _show_machine(self, request: Request) -> Response:
         """Show what 'otolith report' shows, of a time for which the daemon is asked."""
@@ -184,13 +188,14 @@ class SitePages:
 
     async def _show_metrics(self, _: Request) -> Response:
         with self._collector.lock:
-            text = exposition(self._collector.knowledge, self._collector.dropped, time.time())
+            text = exposition(self._collector.knowledge, self._collector.dropped, self._outlets, time.time())
         return Response(text, media_type=CONTENT_TYPE)
 
     async def _show_health(self, _: Request) -> Response:
         is_connected = self._collector.connected
         status = {"status": "ok" if is_connected else "no daemon and no router is connected",
-                  "machines": len(self._collector.knowledge), "since": round(self._started, 1)}  # fmt: skip
+                  "machines": len(self._collector.knowledge), "since": round(self._started, 1),
+                  "outlets": {each.name: each.reason or "ok" for each in self._outlets}}  # fmt: skip
         return JSONResponse(status, 200 if is_connected else 503)
 
     async def _show_live(self, request: Request) -> Response:

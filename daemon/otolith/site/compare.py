@@ -4,8 +4,9 @@ import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from otolith.acquisition.window import Verdict
 from otolith.health.limits import Level
-from otolith.health.schema import Language, ParameterDocument
+from otolith.health.schema import CountersDocument, Language, ParameterDocument
 from otolith.health.text import texts_in, value_text
 from otolith.health.times import moment_text
 from otolith.site.cards import in_language
@@ -42,6 +43,36 @@ class TimedEvent:
     part: str
     condition: str
     state: str
+
+
+@dataclass(frozen=True, slots=True)
+class DataQuality:
+    """What is wrong with the data of a machine, in words."""
+
+    machine: KnownMachine
+    verdict: str
+    missing: str  # Share of the records of the last window without a sample
+    reason: str
+    bad: int  # Windows since the daemon started that were not estimated from because of their quality
+    missed: int  # Windows not estimated from because the worker was down or busy
+
+
+def poor_data(knowledge: Knowledge, now: float, language: Language) -> list[DataQuality]:
+    """Return the machines that speak, and of which the last window was bad or a source is down."""
+    say, found = texts_in(language), []
+    for machine in knowledge.worst_first(now):
+        report = machine.report
+        if report is None or machine.is_silent(now):
+            continue
+        quality, driver, counters = report.window.quality, report.driver, report.counters or CountersDocument()
+        reasons = [*quality.reasons, *([] if driver is None or driver.up else [driver.reason])]
+        if quality.verdict is Verdict.BAD or reasons:
+            words = visible(say.decimals("; ".join(say.translated(reason) for reason in reasons)))
+            missing = say.decimals(f"{quality.missing:.0%}")
+            verdict = say.translated(quality.verdict)
+            own = DataQuality(machine, verdict, missing, words, counters.windows_bad, counters.windows_missed)
+            found.append(own)
+    return found[:MAX_ROWS]
 
 
 def sisters(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[str, str], list[Sister]]:

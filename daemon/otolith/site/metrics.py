@@ -8,7 +8,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from otolith.health.limits import LEVELS, Level
 from otolith.health.schema import CountersDocument, ReportDocument
-from otolith.site.known import Knowledge, KnownMachine
+from otolith.site.known import Knowledge, KnownMachine, RefusedFor
+from otolith.site.outlets.runner import OutletStatus
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 MACHINE = ("site", "machine")
@@ -21,18 +22,20 @@ VALUES = {
 }
 
 
-def exposition(knowledge: Knowledge, dropped: Mapping[str, int], now: float) -> bytes:
+def exposition(knowledge: Knowledge, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float) -> bytes:
     """Return the metrics as text; a machine of which nothing is known has a state, and no values."""
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Source(knowledge, dropped, now))
+    registry.register(_Source(knowledge, dropped, outlets, now))
     return generate_latest(registry)
 
 
 class _Source:
     """What prometheus_client asks for metrics."""
 
-    def __init__(self, knowledge: Knowledge, dropped: Mapping[str, int], now: float) -> None:
-        self._knowledge, self._dropped, self._now = knowledge, dropped, now
+    def __init__(
+        self, knowledge: Knowledge, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float
+    ) -> None:
+        self._knowledge, self._dropped, self._outlets, self._now = knowledge, dropped, tuple(outlets), now
 
     def describe(self) -> Iterable[Metric]:
         """Return nothing: the names are not checked against other collectors."""
@@ -58,13 +61,14 @@ class _Source:
         yield from _parameters(speaking)
         yield from _counters(speaking)
         for name, help_text, counts in (
-            ("refused", "Documents that were refused.", self._knowledge.refused),
-            ("dropped", "Documents that came faster than they could be read.", self._dropped),
+            ("refused", "Documents that were refused.", dict.fromkeys(RefusedFor, 0) | self._knowledge.refused),
+            ("dropped", "Documents that came faster than they could be read.", {"queue": 0} | dict(self._dropped)),
         ):
             metric = CounterMetricFamily(f"otolith_site_documents_{name}", help_text, labels=("reason",))
             for reason, count in sorted(Counter(counts).items()):
                 metric.add_metric((str(reason),), float(count))
             yield metric
+        yield from _outlets(self._outlets)
 
     def _states(self, machines: Iterable[KnownMachine]) -> Metric:
         metric = GaugeMetricFamily(
@@ -78,6 +82,18 @@ class _Source:
                 if level is not Level.HINT:
                     metric.add_metric((*_own(machine), level.name.lower()), float(level is state))
         return metric
+
+
+def _outlets(outlets: Iterable[OutletStatus]) -> Iterator[Metric]:
+    up = GaugeMetricFamily("otolith_outlet_up", "Whether the last try of an outlet succeeded.", labels=("outlet",))
+    rows = {name: CounterMetricFamily(f"otolith_outlet_{name}", text, labels=("outlet",)) for name, text in (
+        ("failures", "Tries of an outlet that failed."), ("sent", "Notices of events that an outlet passed on."),
+        ("lost", "Notices that an outlet dropped: above its limit per hour, or after a long failure."))}  # fmt: skip
+    for outlet in outlets:
+        up.add_metric((outlet.name,), float(outlet.is_up))
+        for name, metric in rows.items():
+            metric.add_metric((outlet.name,), float(getattr(outlet, name)))
+    yield from (up, *rows.values())
 
 
 def _own(machine: KnownMachine) -> tuple[str, str]:

@@ -12,6 +12,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from otolith.publishing.zenoh_config import raise_descriptor_limit
 from otolith.site.app import SitePages
 from otolith.site.collector import Collector
+from otolith.site.outlets.runner import OutletRunner
+from otolith.site.outlets.table import running
 from otolith.site.settings import SiteFile
 from otolith_drivers.errors import ServiceError
 
@@ -57,7 +59,9 @@ class _Server(uvicorn.Server):
         self.should_exit, self.ended_by = True, number
 
 
-def run_site(collector: Collector, settings: SiteFile, ready: Callable[[str], None]) -> int:
+def run_site(
+    collector: Collector, settings: SiteFile, outlets: list[OutletRunner], ready: Callable[[str], None]
+) -> int:
     """Serve until SIGTERM or SIGINT, and return its number; ``ready`` is told the address once it is listened on.
 
     Raises:
@@ -66,8 +70,9 @@ def run_site(collector: Collector, settings: SiteFile, ready: Callable[[str], No
     raise_descriptor_limit()
     host, port = settings.http.address
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    pages = SitePages(collector, settings, [outlet.status for outlet in outlets])
     config = uvicorn.Config(
-        SitePages(collector, settings).app(), http=_Patient, ws="none", lifespan="off", log_config=None,
+        pages.app(), http=_Patient, ws="none", lifespan="off", log_config=None,
         access_log=False, server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS, backlog=BACKLOG,
         timeout_keep_alive=KEEP_ALIVE, timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
     )  # fmt: skip
@@ -80,7 +85,7 @@ def run_site(collector: Collector, settings: SiteFile, ready: Callable[[str], No
             remedy = "set http.listen to another address"
             raise ServiceError(f"http.listen = {settings.http.listen}: {error.strerror}; {remedy}") from error
         server = _Server(config)
-        with collector:
+        with collector, running(outlets):
             ready(f"http://{settings.http.listen}/")
             asyncio.run(server.serve([listening]))
     return server.ended_by

@@ -10,8 +10,9 @@ from otolith.health.schema import Language
 from otolith.machine_file import Endpoint, check_name
 from otolith.publishing.zenoh_config import Connection, Credentials
 from otolith.site.known import MAX_MACHINES
+from otolith.site.outlets.options import OutletsTable
 from otolith_drivers.common.time_zones import check_time_zone
-from otolith_drivers.config_files import StrictModel, parse, read, validate
+from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
 
 OWN_HOSTS = ("localhost", "127.0.0.1", "::1")
 
@@ -80,6 +81,7 @@ class SiteFile(StrictModel):
     """Site and name of each machine that is shown; by default all that report."""
     http: HttpTable = HttpTable()
     zenoh: ReadersTable = ReadersTable()
+    outlets: OutletsTable = OutletsTable()
 
     def connection(self, folder: Path) -> Connection:
         """Return how the site reads daemons; files are named relative to ``folder``."""
@@ -90,7 +92,7 @@ class SiteFile(StrictModel):
         return Connection(self.zenoh.connect, Credentials(ca, certificate, key, login))
 
 
-def load_site(path: Path) -> SiteFile:
-    """Return the site of a file; raise ConfigurationError with a line per fault."""
+def load_site(path: Path) -> tuple[SiteFile, SourceFile]:
+    """Return the site of a file, and its text; raise ConfigurationError with a line per fault."""
     file = read(path)
-    return validate(parse(file), SiteFile, file)
+    return validate(parse(file), SiteFile, file), file

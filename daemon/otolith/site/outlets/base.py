@@ -1,0 +1,100 @@
+"""What outlets share: the view of a machine, notices of its events, and what an outlet does with both."""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Protocol
+
+from otolith.health.limits import Level
+from otolith.health.schema import EventDocument, Language, ReportDocument
+
+SCHEMA = "otolith.notice/1"
+
+
+class OutletError(Exception):
+    """What an outlet could not pass on, and why; it is tried again."""
+
+
+class Told(StrEnum):
+    """What a notice tells of an event."""
+
+    RAISED = "raised"
+    WORSE = "worse"
+    BETTER = "better"
+    CLEARED = "cleared"
+
+
+@dataclass(frozen=True, slots=True)
+class MachineView:
+    """A machine at a moment; its texts are for people, with what controls a line or a screen escaped."""
+
+    site: str
+    name: str
+    state: Level
+    word: str  # Of the state, in the language of the outlets
+    since: float | None  # Unix s; None while nothing is known
+    what: str
+    advice: str
+    report: ReportDocument | None  # None while it is silent
+    revision: tuple[object, ...]  # Another one after each change
+
+    @property
+    def key(self) -> str:
+        """Site and name."""
+        return f"{self.site}/{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """That an event was raised, has changed its state or was cleared."""
+
+    site: str
+    machine: str
+    told: Told
+    event: EventDocument
+
+    @property
+    def key(self) -> str:
+        """The same for each try to pass this notice on, and for no other notice."""
+        at = self.event.since if self.event.end is None else self.event.end
+        return f"{self.site}/{self.machine}/{self.event.id}/{self.told}/{at:.3f}"
+
+    def document(self) -> Mapping[str, Any]:
+        """Return it as a document: ``otolith.notice/1``."""
+        event = self.event
+        state = Level.OK if self.told is Told.CLEARED else event.state
+        own = {"schema": SCHEMA, "key": self.key, "site": self.site, "machine": self.machine, "told": str(self.told),
+               "state": str(state), "part": event.part, "condition": event.condition, "text": event.text,
+               "cause": event.cause, "advice": event.advice, "start": event.start, "since": event.since,
+               "end": event.end, "event": event.id}  # fmt: skip
+        return {name: value for name, value in own.items() if value not in (None, "")}
+
+
+class Outlet(Protocol):
+    """Passes on what is known, in a thread of its own; it may block for some seconds."""
+
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+        """Pass on machines that have changed, those that are ``gone``, and notices, each of which it then removes.
+
+        After an error, and at first, ``views`` has all machines.
+
+        Raises:
+            OutletError: something could not be passed on.
+        """
+
+    def close(self) -> None:
+        """End it."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutletSetup:
+    """What an outlet is built with, besides its options."""
+
+    folder: Path  # Of the file of the site
+    title: str
+    language: Language
+
+
+Build = Callable[[Any, OutletSetup], Outlet]

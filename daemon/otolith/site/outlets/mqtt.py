@@ -1,0 +1,192 @@
+"""States, parameters and events as JSON over MQTT, with the discovery of Home Assistant. It subscribes to nothing."""
+
+import re
+import ssl
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from paho.mqtt import client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion
+
+from otolith import __version__
+from otolith.health.schema import ParameterDocument
+from otolith.site.hall import SHOWN
+from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
+from otolith.site.outlets.connections import failure, tls_context
+from otolith.site.outlets.options import MqttOutlet
+from otolith_drivers.common.credentials import password
+from otolith_drivers.grammars.json_lines import json_text
+from otolith_drivers.outside_text import visible
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+CONNECT_TIMEOUT = 3.0  # s for the network connection
+ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client, and its messages
+KEEPALIVE = 15  # s without a message after which the broker is asked whether it is there
+MAX_DISCOVERED = 64  # parameters of a machine
+ONLINE, OFFLINE = "online", "offline"
+IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template of Home Assistant may have as they are
+
+
+class MqttPublisher:
+    """Implements :class:`otolith.site.outlets.base.Outlet`. Each connection begins with all that is known."""
+
+    def __init__(self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None) -> None:
+        self._options, self._secret, self._tls = options, secret, tls
+        self._client: mqtt.Client | None = None
+        self._discovered: dict[str, frozenset[tuple[str, str]]] = {}  # Parameters and units of a machine
+
+    @property
+    def _availability(self) -> str:
+        return f"{self._options.prefix}/status"
+
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+        """Publish what has changed; see :class:`otolith.site.outlets.base.Outlet`."""
+        client = self._connected()
+        last: mqtt.MQTTMessageInfo | None = None
+        try:
+            for view in views:
+                for topic, document in (*self._discovery(view), *self._documents(view)):
+                    last = _publish(client, topic, document, retain=True)
+            for key in gone:
+                for topic in (*self._topics(key), *self._forgotten(key)):
+                    last = _publish(client, topic, None, retain=True)
+            for notice in notices:
+                topic = f"{self._options.prefix}/{notice.site}/{notice.machine}/event"
+                last = _publish(client, topic, dict(notice.document()), retain=False)
+            if last is not None:
+                last.wait_for_publish(ANSWER_TIMEOUT)
+            if not client.is_connected() or (last is not None and not last.is_published()):
+                raise ConnectionError("the broker does not confirm what it is sent")
+        except (OSError, ValueError, RuntimeError) as error:
+            self.close()
+            raise OutletError(failure(error, self._options.host)) from error
+        notices.clear()
+
+    def close(self) -> None:
+        """Say that the site is away, and end the connection."""
+        client, self._client = self._client, None
+        self._discovered.clear()
+        if client is not None:
+            if client.is_connected():
+                client.publish(self._availability, OFFLINE, qos=1, retain=True).wait_for_publish(1.0)
+            client.disconnect()
+            client.loop_stop()
+
+    def _connected(self) -> mqtt.Client:
+        """Return the client, connected anew if it is not."""
+        if self._client is not None and self._client.is_connected():
+            return self._client
+        self.close()
+        options = self._options
+        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=options.client_id, reconnect_on_failure=False)
+        client.connect_timeout = CONNECT_TIMEOUT
+        client.will_set(self._availability, OFFLINE, qos=1, retain=True)
+        if options.user is not None:
+            client.username_pw_set(options.user, self._secret)
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
+        answered, refusal = threading.Event(), list[str]()
+
+        def on_connect(_: mqtt.Client, __: Any, ___: Any, code: Any, ____: Any) -> None:
+            if code.is_failure:
+                refusal.append(str(code))
+            answered.set()
+
+        client.on_connect = on_connect
+        try:
+            client.connect(options.host, options.port or (8883 if options.tls else 1883), KEEPALIVE)
+            client.loop_start()
+        except (OSError, ValueError) as error:
+            raise OutletError(failure(error, options.host)) from error
+        self._client = client
+        if not answered.wait(ANSWER_TIMEOUT) or refusal:
+            self.close()
+            reason = f"refuses this client: {refusal[0]}" if refusal else "no answer: is a broker there, is tls right?"
+            raise OutletError(f"{options.host}: {reason}")
+        client.publish(self._availability, ONLINE, qos=1, retain=True)
+        return client
+
+    def _topics(self, key: str) -> tuple[str, str, str]:
+        own = f"{self._options.prefix}/{key}"
+        return f"{own}/state", f"{own}/parameters", f"{own}/availability"
+
+    def _documents(self, view: MachineView) -> Iterator[tuple[str, Any]]:
+        state, parameters, availability = self._topics(view.key)
+        since = None if view.since is None else _iso(view.since)
+        yield state, {"site": view.site, "machine": view.name, "state": str(view.state), "word": view.word,
+                      "since": since, "what": view.what, "advice": view.advice}  # fmt: skip
+        if view.report is not None:
+            rows = {visible(name): _row(row) for name, row in view.report.parameters.items()}
+            yield parameters, {"time": _iso(view.report.window.end), "parameters": rows}
+        yield availability, OFFLINE if view.report is None else ONLINE
+
+    def _discovery(self, view: MachineView) -> Iterator[tuple[str, Any]]:
+        """Yield the configurations of its sensors, as Home Assistant documents them, if they are new."""
+        if self._options.discovery is None or view.report is None:
+            return
+        rows = {name: row.unit for name, row in view.report.parameters.items() if IDENTIFIER.fullmatch(name)}
+        own = frozenset(list(rows.items())[:MAX_DISCOVERED])
+        if self._discovered.get(view.key) == own:
+            return
+        self._discovered[view.key] = own
+        state, parameters, availability = self._topics(view.key)
+        device = {"identifiers": [_object_id(view.key)], "name": view.name, "manufacturer": "Otolith",
+                  "model": visible(view.report.twin), "suggested_area": view.site}  # fmt: skip
+        both = {"device": device, "origin": {"name": "otolith", "sw_version": __version__}, "qos": 1}
+        of_site = {"topic": self._availability}
+        yield self._config(view.key, "state"), {
+            **both, "name": "State", "unique_id": f"{_object_id(view.key)}_state", "state_topic": state,
+            "value_template": "{{ value_json.state }}", "json_attributes_topic": state, "device_class": "enum",
+            "options": [str(level) for level in SHOWN], "availability": [of_site], "icon": "mdi:engine",
+        }  # fmt: skip
+        for name, unit in sorted(own):
+            yield self._config(view.key, name), {
+                **both, "name": name, "unique_id": f"{_object_id(view.key)}_{name}", "state_topic": parameters,
+                "value_template": f"{{{{ value_json.parameters['{name}'].value }}}}", "state_class": "measurement",
+                "availability": [of_site, {"topic": availability}], "availability_mode": "all",
+                **({"unit_of_measurement": visible(unit)} if unit not in ("", "1") else {}),
+            }  # fmt: skip
+
+    def _config(self, key: str, name: str) -> str:
+        return f"{self._options.discovery}/sensor/{_object_id(key)}/{name}/config"
+
+    def _forgotten(self, key: str) -> list[str]:
+        """Return the topics of the configurations of a machine that is gone."""
+        own = self._discovered.pop(key, None)
+        return [] if own is None else [self._config(key, name) for name in ("state", *(name for name, _ in own))]
+
+
+def _publish(client: mqtt.Client, topic: str, document: Any, *, retain: bool) -> mqtt.MQTTMessageInfo:
+    text = document if document is None or isinstance(document, str) else json_text(document)
+    content = None if text is None else text.encode(errors="replace")
+    info = client.publish(topic, content, qos=1, retain=retain)
+    if info.rc not in (mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_QUEUE_SIZE):
+        raise ConnectionError(mqtt.error_string(info.rc))
+    return info
+
+
+def _object_id(key: str) -> str:
+    """Return the id of a machine in Home Assistant; no two machines have the same one."""
+    return "otolith_" + key.replace("_", "__").replace("/", "_-_")
+
+
+def _row(row: ParameterDocument) -> dict[str, Any]:
+    own = {"value": row.value, "low": row.low, "high": row.high, "limit": row.limit, "nominal": row.nominal}
+    return {**own, "unit": visible(row.unit), "status": str(row.status)}
+
+
+def _iso(seconds: float) -> str | None:
+    try:
+        return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
+    except (OverflowError, OSError, ValueError):  # no clock has such a time, but a report may
+        return None
+
+
+def build(options: MqttOutlet, setup: OutletSetup) -> MqttPublisher:
+    """Return the outlet; raise ConfigurationError if a file cannot be used."""
+    secret = password(None if options.password_file is None else setup.folder / options.password_file)
+    pair = (options.certificate, options.key)
+    return MqttPublisher(options, secret, tls_context(setup.folder, options.ca, pair) if options.tls else None)

@@ -1,0 +1,103 @@
+"""The tables ``[outlets.*]`` of the file of a site. Files are named relative to it."""
+
+from pathlib import Path
+from typing import Annotated, Self
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field, model_validator
+
+from otolith.machine_file import check_name
+from otolith_drivers.common.credentials import CredentialOptions
+from otolith_drivers.config_files import StrictModel
+
+PerHour = Annotated[int, Field(ge=1, le=3600)]
+Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+def _topic(text: str) -> str:
+    """Return ``text``, or raise ValueError if it cannot begin a topic that is published."""
+    for part in text.split("/"):
+        check_name(part)
+    return text
+
+
+def _web_address(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no address of HTTP."""
+    parts = urlsplit(text)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.username is not None:
+        raise ValueError(f'{text!r} is no address: write it like "https://example.org/hook", without a password')
+    return text
+
+
+def _mail_address(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no address of a mailbox."""
+    name, at, domain = text.rpartition("@")
+    if not (name and at and domain) or not text.isprintable() or any(sign in text for sign in " ,;<>"):
+        raise ValueError(f'{text!r} is no address: write it like "shift@example.org"')
+    return text
+
+
+Topic = Annotated[str, AfterValidator(_topic)]
+MailAddress = Annotated[str, AfterValidator(_mail_address)]
+
+
+class NoticeOptions(StrictModel):
+    """What all outlets have that tell events."""
+
+    per_hour: PerHour = 60  # Notices at most
+
+
+class MqttOutlet(NoticeOptions, CredentialOptions):
+    """``[outlets.mqtt]``: JSON, and the discovery of Home Assistant."""
+
+    host: Annotated[str, Field(min_length=1)]
+    port: Port | None = None  # By default 1883, and 8883 with TLS
+    tls: bool = False
+    ca: Path | None = None  # By default the authorities of the computer
+    client_id: str = ""  # By default a random one
+    prefix: Topic = "otolith"
+    discovery: Topic | None = "homeassistant"
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if not self.tls and (self.ca or self.certificate):
+            raise ValueError("ca, certificate and key belong to tls = true")
+        return self
+
+
+class WebhookOutlet(NoticeOptions):
+    """``[outlets.webhook]``: a request per notice."""
+
+    url: Annotated[str, AfterValidator(_web_address)]
+    secret_file: Path | None = None  # A file whose first line signs each request
+    ca: Path | None = None  # By default the authorities of the computer
+
+
+class MailOutlet(NoticeOptions):
+    """``[outlets.mail]``: an e-mail with the notices of a moment."""
+
+    host: Annotated[str, Field(min_length=1)]
+    port: Port = 587
+    security: Annotated[str, Field(pattern="^(starttls|tls|none)$")] = "starttls"
+    ca: Path | None = None  # By default the authorities of the computer
+    user: str | None = None
+    password_file: Path | None = None  # A file whose first line is the password
+    sender: MailAddress
+    to: Annotated[tuple[MailAddress, ...], Field(min_length=1, max_length=20)]
+    per_hour: PerHour = 20
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user and password_file belong together: set both")
+        if self.user is not None and self.security == "none":
+            raise ValueError('user belongs to security = "starttls" or "tls": the password would be sent as it is')
+        return self
+
+
+class OutletsTable(StrictModel):
+    """``[outlets]``: each table is one outlet. ``/metrics`` for Prometheus is always there."""
+
+    mqtt: MqttOutlet | None = None
+    webhook: WebhookOutlet | None = None
+    mail: MailOutlet | None = None

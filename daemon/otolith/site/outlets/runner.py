@@ -1,0 +1,121 @@
+"""Runs outlets, each in a thread of its own, so that none delays another one, the pages, or what is collected."""
+
+import logging
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+from otolith.health.limits import Level
+from otolith.health.schema import Language
+from otolith.site.cards import card_of
+from otolith.site.collector import Collector
+from otolith.site.known import KnownMachine
+from otolith.site.outlets.base import MachineView, Notice, Outlet, OutletError
+from otolith.site.outlets.notices import Notices, RateLimit
+
+log = logging.getLogger(__name__)
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+TICK = 1.0  # s between two looks for what has changed
+FIRST_PAUSE, MAX_PAUSE = 1.0, 60.0  # s until an outlet that failed is tried again; doubled each time
+MAX_PENDING = 500  # notices that wait for an outlet that fails; the oldest are dropped
+CLOSING = 5.0  # s that an outlet may take to end
+
+
+@dataclass(slots=True)
+class OutletStatus:
+    """How an outlet does, for metrics and for the log."""
+
+    name: str
+    is_up: bool = False
+    reason: str = "not tried yet"
+    failures: int = 0
+    sent: int = 0  # Notices
+    lost: int = 0  # Notices that were dropped, because of the limit per hour or because it failed for too long
+    since: float = field(default_factory=time.time)
+
+
+class OutletRunner:
+    """The thread of an outlet."""
+
+    def __init__(self, name: str, outlet: Outlet, collector: Collector, language: Language, per_hour: int) -> None:
+        """``per_hour`` bounds its notices."""
+        self.status = OutletStatus(name)
+        self._outlet, self._collector, self._language = outlet, collector, language
+        self._notices, self._limit = Notices(time.time()), RateLimit(per_hour)
+        self._pending: deque[Notice] = deque()
+        self._dropped = 0
+        self._shown: dict[str, tuple[object, ...]] = {}  # Revision of each machine that was passed on
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"outlet-{name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it, within :data:`CLOSING`."""
+        self._stopping.set()
+        self._thread.join(CLOSING)
+
+    def _run(self) -> None:
+        pause = TICK  # s
+        while not self._stopping.wait(pause):
+            try:
+                self._pass_on()
+            except OutletError as error:
+                self._fail(str(error))
+            except Exception:  # what machines publish ends no outlet
+                log.exception("%s: a fault of its own", self.status.name)
+                self._fail("a fault of its own, see the log")
+            else:
+                if not self.status.is_up:
+                    log.info("%s: works", self.status.name)
+                self.status.is_up, self.status.reason, pause = True, "", TICK
+                continue
+            pause = min(2.0 * pause, MAX_PAUSE) if pause > TICK else 2.0 * FIRST_PAUSE
+        self._outlet.close()
+
+    def _fail(self, reason: str) -> None:
+        if self.status.is_up or reason != self.status.reason:
+            log.warning("%s: %s", self.status.name, reason)
+        self.status.is_up, self.status.reason = False, reason
+        self.status.failures += 1
+        self._shown.clear()
+
+    def _pass_on(self) -> None:
+        now = time.time()
+        with self._collector.lock:
+            machines = list(self._collector.knowledge)
+            new = self._notices.take(machines)
+            changed = [view for machine in machines if (view := self._view(machine, now)) is not None]
+        self._pending.extend(self._limit.passes(new, now))
+        while len(self._pending) > MAX_PENDING:
+            self._pending.popleft()
+            self._dropped += 1
+        self.status.lost = self._dropped + self._limit.withheld
+        waiting = len(self._pending)
+        known = {f"{machine.site}/{machine.name}" for machine in machines}
+        gone = [key for key in self._shown if key not in known]
+        try:
+            self._outlet.send(changed, gone, self._pending)
+        finally:
+            self.status.sent += waiting - len(self._pending)
+        for key in gone:
+            del self._shown[key]
+        self._shown |= {view.key: view.revision for view in changed}
+
+    def _view(self, machine: KnownMachine, now: float) -> MachineView | None:
+        """Return a machine, None if it was passed on as it is."""
+        state, is_silent = machine.state(now), machine.is_silent(now)
+        revision = (machine.revision, state, is_silent)
+        if self._shown.get(f"{machine.site}/{machine.name}") == revision:
+            return None
+        card = card_of(machine, now, self._language)
+        report = None if is_silent else machine.report
+        health = report.health if report is not None else None
+        since = None if state is Level.NO_DATA or health is None else health.since
+        return MachineView(
+            machine.site, machine.name, state, card.word, since, card.what, card.advice, report, revision
+        )

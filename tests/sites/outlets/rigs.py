@@ -1,0 +1,184 @@
+"""What each outlet passes its knowledge on to, in the tests: real servers, and what they received."""
+
+import email
+import email.policy
+import http.server
+import json
+import socket
+import socketserver
+import threading
+from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from paho.mqtt import client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion
+
+from tests.conftest import free_port
+from tests.drivers.mqtt_broker import mqtt_broker
+from tests.waiting import wait_for
+
+
+class Rig(ABC):
+    """A receiver. Not each outlet has states and events: ``None`` is what it does not have."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.port = folder, free_port(socket.SOCK_STREAM)
+        self._stack = ExitStack()
+
+    @abstractmethod
+    def table(self) -> str:
+        """The lines of its table in the file of a site."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Start the receiver."""
+
+    def stop(self) -> None:
+        """End the receiver."""
+        self._stack.close()
+
+    def states(self) -> dict[str, str] | None:
+        """The state of each machine, as a reader gets it who comes now."""
+        return None
+
+    @abstractmethod
+    def events(self) -> list[tuple[str, str]] | None:
+        """Machine and what was told, in the order in which it came."""
+
+
+class _Posted(http.server.BaseHTTPRequestHandler):
+    def do_POST(self) -> None:
+        content = self.rfile.read(int(self.headers["content-length"]))
+        self.server.received.append((dict(self.headers), content))  # type: ignore[attr-defined]
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - as http.server has it
+        """Keep quiet."""
+
+
+class WebhookRig(Rig):
+    """A server of HTTP."""
+
+    received: list[tuple[dict[str, str], bytes]]
+
+    def table(self) -> str:
+        (self.folder / "secret").write_text("of this test\n", encoding="utf-8")
+        (self.folder / "secret").chmod(0o600)
+        return f'url = "http://127.0.0.1:{self.port}/hook?a=1"\nsecret_file = "secret"'
+
+    def start(self) -> None:
+        self.received = []
+        server = http.server.ThreadingHTTPServer(("127.0.0.1", self.port), _Posted)
+        server.received = self.received  # type: ignore[attr-defined]
+        _serve(server, self._stack)
+
+    def events(self) -> list[tuple[str, str]]:
+        documents = [json.loads(content) for _, content in self.received]
+        return [(row["machine"], row["told"]) for row in documents]
+
+
+class _Mailbox(socketserver.StreamRequestHandler):
+    def handle(self) -> None:
+        self.wfile.write(b"220 test\r\n")
+        while line := self.rfile.readline(1000).strip().upper():
+            if line.startswith(b"DATA"):
+                self.wfile.write(b"354 go on\r\n")
+                lines = iter(self.rfile.readline, b".\r\n")
+                text = b"".join(line.removeprefix(b".") for line in lines)
+                self.server.received.append(text)  # type: ignore[attr-defined]
+            self.wfile.write(b"221 bye\r\n" if line.startswith(b"QUIT") else b"250 test\r\n")
+
+
+class MailRig(Rig):
+    """A server of SMTP."""
+
+    received: list[bytes]
+
+    def table(self) -> str:
+        own = f'host = "127.0.0.1"\nport = {self.port}\nsecurity = "none"\nsender = "site@works.example"'
+        return f'{own}\nto = ["shift@works.example"]'
+
+    def start(self) -> None:
+        self.received = []
+        server = socketserver.ThreadingTCPServer(("127.0.0.1", self.port), _Mailbox, bind_and_activate=False)
+        server.allow_reuse_address = server.daemon_threads = True
+        server.server_bind()
+        server.server_activate()
+        server.received = self.received  # type: ignore[attr-defined]
+        _serve(server, self._stack)
+
+    def messages(self) -> list[email.message.EmailMessage]:
+        """What was received."""
+        return [email.message_from_bytes(text, policy=email.policy.default) for text in self.received]
+
+    def events(self) -> list[tuple[str, str]]:
+        words = {"OK": "cleared", "WATCH": "raised", "ACT": "raised"}
+        found = []
+        for message in self.messages():
+            body = message.get_content()
+            for line in body.splitlines():
+                word, _, rest = line.partition(" ")
+                if word in words and rest.count(": ") >= 2:
+                    found.append((rest.partition(":")[0], words[word]))
+        return found
+
+
+class MqttRig(Rig):
+    """A broker, and a subscriber that comes before all, and one that comes now."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._received: list[mqtt.MQTTMessage] = []
+
+    def table(self) -> str:
+        return f'host = "127.0.0.1"\nport = {self.port}'
+
+    def start(self) -> None:
+        self._stack.enter_context(mqtt_broker(self.port, self.folder))
+        client, is_subscribed = self.subscriber(self._received)
+        self._stack.callback(client.loop_stop)
+        self._stack.callback(client.disconnect)
+        wait_for(is_subscribed.is_set)
+
+    def subscriber(self, received: list[mqtt.MQTTMessage]) -> tuple[mqtt.Client, threading.Event]:
+        """A client that subscribes all, and what says that it has."""
+        client, is_subscribed = mqtt.Client(CallbackAPIVersion.VERSION2), threading.Event()
+        client.on_message = lambda _, __, message: received.append(message)
+        client.on_subscribe = lambda *_: is_subscribed.set()
+        client.connect("127.0.0.1", self.port)
+        client.subscribe("#", 1)
+        client.loop_start()
+        return client, is_subscribed
+
+    def retained(self) -> dict[str, bytes]:
+        """What a subscriber gets that comes now."""
+        received: list[mqtt.MQTTMessage] = []
+        client, is_subscribed = self.subscriber(received)
+        wait_for(is_subscribed.is_set)
+        client.publish("end", b"of what is retained", qos=1)
+        wait_for(lambda: any(message.topic == "end" for message in received))
+        client.disconnect()
+        client.loop_stop()
+        return {message.topic: bytes(message.payload) for message in received if message.topic != "end"}
+
+    def states(self) -> dict[str, str]:
+        found = {topic: json.loads(text) for topic, text in self.retained().items() if topic.endswith("/state")}
+        return {row["machine"]: row["state"] for row in found.values()}
+
+    def events(self) -> list[tuple[str, str]]:
+        own = [json.loads(each.payload) for each in list(self._received) if each.topic.endswith("/event")]
+        return [(row["machine"], row["told"]) for row in own]
+
+
+def _serve(server: socketserver.TCPServer, stack: ExitStack) -> None:
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    stack.callback(thread.join)
+    stack.callback(server.server_close)
+    stack.callback(server.shutdown)
+
+
+RIGS: dict[str, type[Rig]] = {"mqtt": MqttRig, "webhook": WebhookRig, "mail": MailRig}

@@ -1,0 +1,192 @@
+"""Metrics, and the files for Prometheus, Alertmanager and Grafana: each metric that one names is there."""
+
+import http.client
+import json
+import re
+import shutil
+import socket
+import subprocess
+import time
+import tomllib
+import urllib.parse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from otolith.health.limits import Level
+from otolith.health.schema import CostDocument, DriverDocument
+from otolith.site.known import Knowledge
+from otolith.site.metrics import exposition
+from otolith.site.outlets.runner import OutletStatus
+from otolith.site.settings import SiteFile
+from tests.conftest import free_port
+from tests.hostile import HOSTILE
+from tests.sites.machines import Stranger, raised, report_of, sent
+from tests.sites.serving import serving
+from tests.storage.histories import SITE, START
+from tests.waiting import wait_for, within
+
+FILES = Path(__file__).parents[2] / "config" / "site"
+NAME = re.compile(r"\botolith_\w+")
+PROMETHEUS, PROMTOOL, AMTOOL = (shutil.which(name) for name in ("prometheus", "promtool", "amtool"))
+
+
+def scraped(knowledge: Knowledge, now: float = START) -> str:
+    return exposition(knowledge, {"queue": 1}, [OutletStatus("mqtt")], now).decode()
+
+
+def known(count: int = 1, **update: Any) -> Knowledge:
+    knowledge = Knowledge()
+    for index in range(count):
+        report = report_of(f"press-{index}", state=Level.ACT, events=(raised(),))
+        own = {"cost": CostDocument(latency_s=0.2), "driver": DriverDocument(up=True)} | update
+        knowledge.take(*sent(report.model_copy(update=own)), START)
+    return knowledge
+
+
+def exported() -> set[str]:
+    return {sample.name for family in text_string_to_metric_families(scraped(known())) for sample in family.samples}
+
+
+def test_a_scrape_has_states_values_intervals_limits_and_counters() -> None:
+    text = scraped(known())
+    own, labels = f'machine="press-0",site="{SITE}"', f'machine="press-0",parameter="R_a",site="{SITE}",unit="ohm"'
+    for line in (f'otolith_machine_state{{{own},state="act"}} 1.0', f"otolith_machine_up{{{own}}} 1.0",
+                 f"otolith_events_open{{{own}}} 1.0", f"otolith_report_latency_seconds{{{own}}} 0.2",
+                 f"otolith_source_up{{{own}}} 1.0", f"otolith_daemon_windows_total{{{own}}} 1.0",
+                 f'otolith_parameter_low{{{labels}}} 6.48'):  # fmt: skip
+        assert line in text
+
+
+def test_names_keep_the_conventions_of_prometheus() -> None:
+    for family in text_string_to_metric_families(scraped(known())):
+        assert re.fullmatch(r"[a-z_]+", family.name)
+        assert family.documentation.endswith(".")
+        assert all(sample.name.endswith("_total") for sample in family.samples) == (family.type == "counter")
+
+
+def test_a_silent_machine_has_a_state_and_no_values() -> None:
+    text = scraped(known(), START + 3600.0)
+    assert 'state="no_data"} 1.0' in text
+    assert "otolith_parameter_value{" not in text
+    assert f'otolith_machine_up{{machine="press-0",site="{SITE}"}} 0.0' in text
+
+
+def test_no_text_ends_a_label_or_a_line() -> None:
+    parameter = report_of().parameters["R_a"]
+    texts = [text.encode(errors="replace").decode() for text in HOSTILE if len(text) < 1000]
+    rows = {text: parameter.model_copy(update={"unit": text}) for text in texts}
+    families = list(text_string_to_metric_families(scraped(known(parameters=rows))))
+    (values,) = [family for family in families if family.name == "otolith_parameter_value"]
+    assert {(sample.labels["parameter"], sample.labels["unit"]) for sample in values.samples} == {
+        (text, text) for text in texts
+    }
+
+
+@pytest.mark.timed
+def test_two_hundred_machines_are_scraped_in_50_ms() -> None:
+    knowledge, times = known(200), []
+    for _ in range(9):
+        begun = time.perf_counter()
+        scraped(knowledge)
+        times.append(time.perf_counter() - begun)
+    assert sorted(times)[4] <= within(0.05)
+
+
+@pytest.mark.parametrize("name", ["prometheus-rules.yml", "grafana-dashboard.json"])
+def test_each_metric_of_a_file_is_exported(name: str) -> None:
+    named = set(NAME.findall((FILES / name).read_text(encoding="utf-8")))
+    assert named
+    assert named <= exported()
+
+
+def test_the_example_of_a_site_is_one() -> None:
+    text = (FILES / "site.toml").read_text(encoding="utf-8")
+    SiteFile.model_validate(tomllib.loads(text))
+    whole = re.sub(r"^# (?=[\[\w]+(?: =|\.|\]))", "", text, flags=re.MULTILINE)
+    every = SiteFile.model_validate(tomllib.loads(whole))
+    assert every.outlets.mqtt is not None
+    assert every.outlets.mail is not None
+    assert every.outlets.webhook is not None
+
+
+def test_panels_of_the_dashboard_cover_no_other_and_ask_the_chosen_source() -> None:
+    board = json.loads((FILES / "grafana-dashboard.json").read_text(encoding="utf-8"))
+    taken: set[tuple[int, int]] = set()
+    for panel in board["panels"]:
+        place = panel["gridPos"]
+        cells = {(place["x"] + i, place["y"] + j) for i in range(place["w"]) for j in range(place["h"])}
+        assert not cells & taken
+        taken |= cells
+        assert place["x"] + place["w"] <= 24
+        assert {target["datasource"]["uid"] for target in panel["targets"]} == {"${datasource}"}
+    assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
+
+
+@pytest.mark.skipif(PROMTOOL is None, reason="no promtool: apt install prometheus")
+def test_promtool_takes_metrics_rules_and_configuration() -> None:
+    assert PROMTOOL is not None
+    assert subprocess.run([PROMTOOL, "check", "config", str(FILES / "prometheus.yml")], check=False).returncode == 0
+    done = subprocess.run([PROMTOOL, "check", "metrics"], input=scraped(known()), text=True, check=False)
+    assert done.returncode == 0
+
+
+@pytest.mark.skipif(AMTOOL is None, reason="no amtool: apt install prometheus-alertmanager")
+def test_amtool_takes_the_configuration_of_alertmanager() -> None:
+    assert AMTOOL is not None
+    assert subprocess.run([AMTOOL, "check-config", str(FILES / "alertmanager.yml")], check=False).returncode == 0
+
+
+@contextmanager
+def prometheus(folder: Path, target: str) -> Iterator[Callable[..., Any]]:
+    """A real one, with the rules that are shipped; yields what asks its API."""
+    assert PROMETHEUS is not None
+    shutil.copy(FILES / "prometheus-rules.yml", folder)
+    own = (FILES / "prometheus.yml").read_text(encoding="utf-8").replace("15s", "1s").replace("127.0.0.1:8420", target)
+    (folder / "prometheus.yml").write_text(re.sub(r"(?m)^alerting:\n(?: .*\n)+", "", own), encoding="utf-8")
+    address = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    command = [PROMETHEUS, f"--config.file={folder}/prometheus.yml", f"--storage.tsdb.path={folder}/data",
+               f"--web.listen-address={address}"]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield lambda path, **query: _asked(address, f"/api/v1/{path}", query)
+        finally:
+            process.kill()
+
+
+def _asked(address: str, path: str, query: dict[str, str]) -> Any:
+    connection = http.client.HTTPConnection(address, timeout=10.0)
+    try:
+        connection.request("GET", f"{path}?{urllib.parse.urlencode(query)}")
+        return json.load(connection.getresponse())["data"]
+    except (OSError, KeyError, ValueError) as error:  # it does not listen yet, or refuses the query
+        return {"alerts": [], "result": [], "error": repr(error)}
+    finally:
+        connection.close()
+
+
+@pytest.mark.skipif(PROMETHEUS is None, reason="no prometheus: apt install prometheus")
+def test_a_real_prometheus_scrapes_a_site_and_its_alert_fires(tmp_path: Path) -> None:
+    stranger = Stranger("press-9")
+    with serving(tmp_path, stranger.endpoint) as site, prometheus(tmp_path, f"127.0.0.1:{site.port}") as ask:
+
+        def firing() -> set[tuple[str, str]]:
+            stranger.publish(report_of("press-9", None, time.time(), state=Level.ACT, events=(raised(),)))
+            alerts = ask("alerts")["alerts"]
+            return {(row["labels"]["alertname"], row["labels"]["machine"]) for row in alerts
+                    if row["state"] == "firing"}  # fmt: skip
+
+        wait_for(lambda: firing() == {("OtolithMachineAct", "press-9")})
+        board = json.loads((FILES / "grafana-dashboard.json").read_text(encoding="utf-8"))
+        for panel in board["panels"]:
+            for target in panel["targets"]:
+                expression = re.sub(r"\$(site|machine)", ".*", target["expr"]).replace("$parameter", "R_a")
+                found = ask("query", query=expression)
+                assert "error" not in found, expression
+                is_new = "rate(" in expression or "latency" in expression
+                assert is_new or found["result"] or "refused" in expression, expression
+    stranger.close()
