@@ -1,5 +1,8 @@
 """The file of a site: what it refuses, and what it takes as it is."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -59,3 +62,13 @@ def test_each_word_is_in_each_language() -> None:
 @pytest.mark.parametrize("header", ["", "fr", ",", ";q=1", *HOSTILE])
 def test_an_unknown_language_is_english(header: str) -> None:
     assert accepted(header) == "en"
+
+
+@pytest.mark.parametrize("text", ["titel = 1", '[outlets.webhook]\nurl = "https://a.example"\nsecret_file = "nowhere"'])
+def test_a_wrong_file_ends_with_the_code_after_which_systemd_does_not_start_it_again(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "site.toml"
+    file.write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "otolith", "site", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == os.EX_CONFIG
+    assert_says(done.stderr, "site.toml")

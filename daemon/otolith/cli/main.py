@@ -61,7 +61,7 @@ Exit codes:
        reproduce: a report was not the same
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
-  78   the same of 'run' for a machine file that is wrong: no restart helps
+  78   the same of 'run' and 'site' for a file that is wrong: no restart helps
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
 
 

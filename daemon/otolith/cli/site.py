@@ -1,6 +1,7 @@
 """``otolith site``: one page for all machines, and what is known of them for other systems."""
 
 import importlib.util
+import os
 import signal
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def site(file: Path | None, verbose: bool) -> int:
       otolith site
       otolith site site.toml
     """
-    from otolith_drivers.errors import ServiceError, installation_of
+    from otolith_drivers.errors import ConfigurationError, ServiceError, installation_of
 
     if lacking := [name for name in EXTRA if importlib.util.find_spec(name) is None]:
         raise ServiceError(f"{', '.join(lacking)} is missing: {installation_of('site')}")
@@ -38,10 +39,14 @@ def site(file: Path | None, verbose: bool) -> int:
     from otolith.site.settings import SiteFile, load_site
 
     log_to_stderr(verbose=verbose)
-    settings, source = (SiteFile(), None) if file is None else load_site(file)
     folder = Path() if file is None else file.parent.absolute()
-    collector = Collector(settings.connection(folder), settings.machines)
-    setup = OutletSetup(folder, settings.title, settings.language or "en")
-    outlets = runners_of(settings.outlets, setup, collector, source)
+    try:
+        settings, source = (SiteFile(), None) if file is None else load_site(file)
+        collector = Collector(settings.connection(folder), settings.machines)
+        setup = OutletSetup(folder, settings.title, settings.language or "en")
+        outlets = runners_of(settings.outlets, setup, collector, source)
+    except ConfigurationError as error:
+        error.exit_code = os.EX_CONFIG  # as 'otolith run', so that systemd does not start it again
+        raise
     ended_by = run_site(collector, settings, outlets, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
     return INTERRUPTED if ended_by == signal.SIGINT else 0
