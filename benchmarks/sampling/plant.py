@@ -102,14 +102,14 @@ def _scan(factors: Array, terms: Array, first: float) -> Array:
 def phi_1(exponents: Array) -> Array:
     """Return (exp(x) - 1) / x."""
     safe = np.where(np.abs(exponents) < SMALL, 1.0, exponents)
-    series = 1.0 + exponents / 2.0 + exponents**2 / 6.0 + exponents**3 / 24.0
+    series = 1.0 + exponents * (1.0 / 2.0 + exponents * (1.0 / 6.0 + exponents / 24.0))
     return np.where(np.abs(exponents) < SMALL, series, np.expm1(safe) / safe)
 
 
 def phi_2(exponents: Array) -> Array:
     """Return (exp(x) - 1 - x) / x²."""
     safe = np.where(np.abs(exponents) < SMALL, 1.0, exponents)
-    series = 0.5 + exponents / 6.0 + exponents**2 / 24.0 + exponents**3 / 120.0
+    series = 1.0 / 2.0 + exponents * (1.0 / 6.0 + exponents * (1.0 / 24.0 + exponents / 120.0))
     return np.where(np.abs(exponents) < SMALL, series, (np.expm1(safe) - safe) / safe**2)
 
 
