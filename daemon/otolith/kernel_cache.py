@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 MAX_BYTES = 200_000_000  # of the cache: the least recently used kernels beyond are removed
 MIN_FREE_BYTES = 32 << 20  # of the disk of the cache, below which kernels are kept in another folder
-GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
+GENERATOR = [*sorted((Path(__file__).parent / "twin").glob("*.py")), Path(__file__).parent / "fmu" / "calls.py"]
 SOURCE = "(source of a twin)"
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 

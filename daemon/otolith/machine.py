@@ -13,8 +13,11 @@ from typing import Any
 
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
-from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
+from otolith.estimation.problem import Problem, SwarmOptions, key_of
 from otolith.estimation.sensor_models import SensorModel
+from otolith.fmu.description import read_fmu
+from otolith.fmu.trial import FmuTrial, try_fmu
+from otolith.fmu_twin import twin_of_fmu
 from otolith.health.diagnosis import COMMAND, LIMITS, MonitoringPlan, Rule, RulesFile, worded
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity
 from otolith.health.schema import Language
@@ -27,12 +30,12 @@ from otolith.machine_file import (
     RawQuantity,
     SignalTable,
     UnmeasuredTable,
-    WindowTable,
     build_driver,
     driver_configs,
     observed_signals,
     own_keys,
     signal_units,
+    window_options,
 )
 from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
@@ -40,7 +43,7 @@ from otolith.twin.language import MAX_COEFFICIENT, read_twin, with_performance
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
-from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, are_of_one_quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
 
@@ -51,8 +54,6 @@ TWIN_LIMITS, OWN_LIMITS = "the limits of the twin do not fit this value", "write
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MIN_OUTPUT_NOISE = 1e-12  # in the unit of the output: the residual is divided by the noise
-MIN_WINDOW_RECORDS, MAX_WINDOW_RECORDS = 10, 1_000_000
-MAX_GRID_ERROR = 1e-6  # share of a window's length by which it may differ from a multiple of the sample period
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +89,14 @@ class LoadedMachine:
         if self.built_driver is None:
             raise ConfigurationError(f"{self.path}: loaded without its driver")
         return self.built_driver
+
+    def try_fmu(self) -> FmuTrial | None:
+        """Return what a child process found of the FMU of the twin; None if the twin has none.
+
+        Raises:
+            ConfigurationError: the FMU cannot be used; with the reason.
+        """
+        return None if self.twin.fmu is None else try_fmu(self.twin.fmu)
 
     @property
     def title(self) -> str:
@@ -277,8 +286,16 @@ def load_twin(path: Path) -> Definition:
 
 
 def _twin(file: MachineFile, path: Path, context: Context) -> Definition:
-    if (file.twin.name is None) == (file.twin.file is None):
-        context.fail(("twin",), 'write either name = "dc_motor", a twin of the library, or file = "my-twin.toml"')
+    if sum(key is not None for key in (file.twin.name, file.twin.file, file.twin.fmu)) != 1:
+        choice = 'name = "dc_motor", a twin of the library, or file = "my-twin.toml", or fmu = "motor.fmu"'
+        context.fail(("twin",), f"write either {choice}")
+    if file.twin.variables and file.twin.fmu is None:
+        context.fail(("twin", "variables"), "names variables of an FMU: write fmu as well, or leave it out")
+    if file.twin.fmu is not None:
+        with context.at("twin", "fmu"):
+            description = read_fmu(path.parent / file.twin.fmu)
+        bounded = {name: (row.low is not None, row.high is not None) for name, row in file.parameters.items()}
+        return twin_of_fmu(description, file.twin.variables, bounded, context.fail)
     if file.twin.file is not None:
         with context.at("twin", "file"):
             page = read(path.parent / file.twin.file)
@@ -304,7 +321,7 @@ def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:
         determined_within=file.estimation.determined_within,
         excluded=_excluded(file.discovery, twin, context),
         discover=file.discovery.enabled,
-        window=_window(file.window, context),
+        window=window_options(file.window, context),
         swarm=SwarmOptions(**file.swarm.model_dump(exclude={"seed"})),
         seed=file.swarm.seed,
     )
@@ -414,7 +431,7 @@ def _own_values(file: MachineFile, twin: Definition, complete: Definition) -> fr
     tables = file.parameters
     written = {name for name, table in tables.items() if table.value is not None}
     limited = {name for name in written if tables[name].watch is not None or tables[name].act is not None}
-    written |= {row.name for row in complete.parameters} if file.twin.file is not None else set()
+    written |= {row.name for row in complete.parameters} if file.twin.name is None else set()
     return frozenset(name for name in written if name in limited or not stands_for_load(name, twin, complete))
 
 
@@ -533,38 +550,11 @@ def _noise(
     levels = {}
     for name, (unit, default) in defaults.items():
         with context.at(table, name):
+            if math.isnan(default) and name not in written:
+                raise ValueError(f'an FMU states no noise of its outputs: write {name} = "0.05 {unit}", or so')
             low = 0.0 if default == 0.0 else MIN_OUTPUT_NOISE
             levels[name] = Quantity(unit, low=low, difference=True)(written[name]) if name in written else default
     return levels
-
-
-def _window(table: WindowTable, context: Context) -> WindowOptions:
-    records = {}
-    for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
-        seconds = table.length if length is None else length
-        records[key] = round(seconds / table.sample_period)
-        if problem := _length_problem(seconds, table.sample_period):
-            context.fail(("window", key), problem)
-    if not records["shortest"] <= records["length"] <= records["longest"]:
-        context.fail(("window", "length"), f"{table.length:g} s must lie between window.shortest and window.longest")
-    return WindowOptions(records["length"], records["shortest"], records["longest"], table.sample_period)
-
-
-def _length_problem(seconds: float, period: float) -> str:
-    """Return why a window of ``seconds`` has no grid of ``period`` (s), with lengths that have one; empty if it has."""
-    count = round(seconds / period)
-    given = f"{seconds:.9g} s at {period:g} s give {counted(count, 'record')}"
-    if seconds < MIN_WINDOW_RECORDS * period * (1.0 - MAX_GRID_ERROR):
-        least = f"write at least {MIN_WINDOW_RECORDS * period:.9g} s, or shorten sample_period"
-        return f"{given}: a window needs {MIN_WINDOW_RECORDS}: {least}"
-    if count > MAX_WINDOW_RECORDS:
-        most = f"write at most {MAX_WINDOW_RECORDS * period:.9g} s, or lengthen sample_period"
-        return f"{given}: more than {MAX_WINDOW_RECORDS}: {most}"
-    if abs(count * period - seconds) <= MAX_GRID_ERROR * seconds:
-        return ""
-    below = math.floor(seconds / period)
-    proposed = f"write {below * period:.9g} s or {(below + 1) * period:.9g} s"
-    return f"{seconds:.9g} s is no whole multiple of the sample period {period:g} s: {proposed}"
 
 
 def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> frozenset[str]:

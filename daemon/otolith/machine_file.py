@@ -5,6 +5,7 @@
 
 import contextlib
 import ipaddress
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from otolith.acquisition.samples import Check
-from otolith.estimation.problem import AlgorithmName
+from otolith.estimation.problem import AlgorithmName, WindowOptions
+from otolith.fmu_twin import VARIABLES, Variables
 from otolith.health.diagnosis import OwnRule
 from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
@@ -25,7 +27,7 @@ from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, fi
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.time_zones import check_time_zone
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.sources import SeveralSources
 from otolith_drivers.units import Quantity
 
@@ -94,6 +96,11 @@ RawQuantity = str | float | None  # A quantity as written; converted once the tw
 WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
 
 
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MIN_WINDOW_RECORDS, MAX_WINDOW_RECORDS = 10, 1_000_000
+MAX_GRID_ERROR = 1e-6  # share of a window's length by which it may differ from a multiple of the sample period
+
+
 class MachineTable(StrictModel):
     """Identity of the machine; both names become part of Zenoh keys and file names."""
 
@@ -106,10 +113,12 @@ class MachineTable(StrictModel):
 
 
 class TwinTable(StrictModel):
-    """The twin: either the name of one in the library, or a file."""
+    """The twin: either the name of one in the library, or a file, or an FMU with names for its variables."""
 
     name: str | None = None
     file: Path | None = None
+    fmu: Path | None = None
+    variables: Variables = VARIABLES
 
 
 class LimitsTable(StrictModel):
@@ -466,3 +475,39 @@ def build_driver(configs: Sequence[DriverConfig]) -> Driver:
 def own_keys(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a signal by which its driver reads it."""
     return {key: value for key, value in table.items() if key not in SignalTable.model_fields}
+
+
+def window_options(table: WindowTable, context: Context) -> WindowOptions:
+    """Return the lengths of windows in records; raise ConfigurationError if one does not fit the sample period."""
+    records = {}
+    for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
+        seconds = table.length if length is None else length
+        records[key] = round(seconds / table.sample_period)
+        if problem := _length_problem(seconds, table.sample_period):
+            context.fail(("window", key), problem)
+    if not records["shortest"] <= records["length"] <= records["longest"]:
+        context.fail(("window", "length"), f"{table.length:g} s must lie between window.shortest and window.longest")
+    return WindowOptions(records["length"], records["shortest"], records["longest"], table.sample_period)
+
+
+def whole_length(length: float, period: float) -> float:
+    """Return the nearest length in s that a machine file accepts."""
+    records = max(round(length / period), MIN_WINDOW_RECORDS, math.ceil(0.1 / period))
+    return float(f"{records * period:.9g}")
+
+
+def _length_problem(seconds: float, period: float) -> str:
+    """Return why a window of ``seconds`` has no grid of ``period`` (s), with lengths that have one; empty if it has."""
+    count = round(seconds / period)
+    given = f"{seconds:.9g} s at {period:g} s give {counted(count, 'record')}"
+    if seconds < MIN_WINDOW_RECORDS * period * (1.0 - MAX_GRID_ERROR):
+        least = f"write at least {MIN_WINDOW_RECORDS * period:.9g} s, or shorten sample_period"
+        return f"{given}: a window needs {MIN_WINDOW_RECORDS}: {least}"
+    if count > MAX_WINDOW_RECORDS:
+        most = f"write at most {MAX_WINDOW_RECORDS * period:.9g} s, or lengthen sample_period"
+        return f"{given}: more than {MAX_WINDOW_RECORDS}: {most}"
+    if abs(count * period - seconds) <= MAX_GRID_ERROR * seconds:
+        return ""
+    below = math.floor(seconds / period)
+    proposed = f"write {below * period:.9g} s or {(below + 1) * period:.9g} s"
+    return f"{seconds:.9g} s is no whole multiple of the sample period {period:g} s: {proposed}"

@@ -126,6 +126,7 @@ class Twin:
             otolith_drivers.errors.ConfigurationError: the file cannot be used; it says why.
         """
         machine = load_machine(Path(path), with_driver=False)
+        machine.try_fmu()
         names = machine.file.machine
         state = initial_state(names.name, names.site, machine.problem, machine.plan)
         return cls(machine, state, state.posterior)

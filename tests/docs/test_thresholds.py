@@ -32,7 +32,7 @@ SOURCES = {
     "site": [DAEMON / "site", DAEMON / "site" / "outlets"],
     "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],
-    "twin": [DAEMON / "twin"],
+    "twin": [DAEMON / "twin", DAEMON / "fmu", DAEMON],
 }
 PAGES = sorted((ROOT / "docs" / "reference").glob("thresholds-*.md"))
 CODE = re.compile(r"`([^`]+)`")

@@ -8,6 +8,7 @@ import pytest
 from pydantic import BaseModel, TypeAdapter
 
 from otolith import machine_file
+from otolith.fmu_twin import VariableTable
 from otolith.health.diagnosis import OwnRule
 from otolith_drivers.canbus import driver as can
 from otolith_drivers.canbus.options import MessageTable, PdoTable
@@ -23,6 +24,7 @@ SIGNAL = "key of a signal"
 TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[machine]", "key", machine_file.MachineTable),
     ("[twin]", "key", machine_file.TwinTable),
+    ("[twin]", "key of a variable", VariableTable),
     ("[parameters]", "key", machine_file.ParameterTable),
     ("[components]", "key", machine_file.LimitsTable),
     ("[[rule]]", "key", OwnRule),

@@ -15,7 +15,8 @@ def twin_fingerprint(twin: Definition) -> str:
     constants = [(each.name, each.unit, each.value) for each in twin.constants]
     definitions = [(name, expression) for name, expression, _ in twin.definitions]
     places = [(each.name, each.unit, each.into, each.mode, each.through) for each in twin.sites]
-    return _hash([named, inputs, constants, definitions, places, twin.equations])
+    of_fmu = [] if twin.fmu is None else [twin.fmu.digest]
+    return _hash([named, inputs, constants, definitions, places, twin.equations, *of_fmu])
 
 
 def configuration_fingerprint(problem: Problem) -> str:

@@ -147,6 +147,7 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
     faulthandler.enable()  # systemd's watchdog sends SIGABRT: the log then has where each thread was
     try:
         machine = load_machine(file)
+        machine.try_fmu()
     except ConfigurationError as error:
         error.exit_code = os.EX_CONFIG  # so that systemd distinguishes it from a bus that may come up later
         raise
@@ -285,6 +286,7 @@ def compile_command(file: Path) -> None:
     from otolith_drivers.user_dirs import cache_directory
 
     machine, begun = load_machine(file, with_driver=False), time.monotonic()
+    machine.try_fmu()
     folder, count, done = cache_directory("kernels"), 0, 0
     with progress_line(f"compiling {machine.twin.name}") as show:
 

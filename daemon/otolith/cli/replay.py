@@ -143,6 +143,7 @@ def replay(
         OSError: the page cannot be written.
     """
     machine = load_machine(file, with_driver=False)
+    machine.try_fmu()
     summary = ReplaySummary()
     with open_recordings(machine, data) as recorded:
         if recorded.ignored:

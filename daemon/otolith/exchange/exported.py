@@ -69,8 +69,10 @@ def exported_twin(posterior: Posterior) -> ExportedTwin:
     """Return the twin with the values, components and the state that are known.
 
     Raises:
-        ValueError: no window has been learned from yet.
+        ValueError: no window has been learned from yet, or the equations are those of an FMU.
     """
+    if posterior.problem.base_model.fmu is not None:
+        raise ValueError("its equations are in an FMU, which other tools import as it is")
     return _Export(posterior).twin()
 
 

@@ -25,7 +25,8 @@ from otolith.estimation.objective import Objective, adc_step
 from otolith.estimation.problem import Problem, WindowOptions
 from otolith.estimation.sensor_models import shown_model
 from otolith.health.times import in_local_time
-from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
+from otolith.machine import LoadedMachine
+from otolith.machine_file import whole_length
 from otolith.runtime.replay import Replay, Stopped, open_recordings
 from otolith.runtime.worker import perform, warm_up
 from otolith_drivers.errors import counted
@@ -367,12 +368,6 @@ def _proposed_period(statistics: RecordingStatistics, configured: float) -> floa
     if not math.isfinite(fastest) or abs(fastest / configured - 1.0) <= MAX_PERIOD_ERROR:
         return configured
     return float(f"{np.clip(fastest, 1e-4, 10.0):.3g}")
-
-
-def whole_length(length: float, period: float) -> float:
-    """Return the nearest length in s that a machine file accepts."""
-    records = max(round(length / period), MIN_WINDOW_RECORDS, math.ceil(0.1 / period))
-    return float(f"{records * period:.9g}")
 
 
 def _proposed_length(windows: WindowPreview, duration: float, period: float) -> float:

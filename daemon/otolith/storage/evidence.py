@@ -56,6 +56,7 @@ log = logging.getLogger(__name__)
 
 VERSION = 8  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
+FMU = "fmu.txt"  # in place of the twin: which FMU has its equations
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
 PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
@@ -243,6 +244,8 @@ def _read_bundle(path: Path) -> Bundle:
     if (count := packed.count(ENTRY)) > MAX_ENTRIES:
         raise ValueError(f"{count} files in it: at most {MAX_ENTRIES}")
     archive = zipfile.ZipFile(io.BytesIO(packed))
+    if FMU in archive.namelist():
+        raise ValueError("its equations are in an FMU, which is a program: a bundle has none")
     with archive.open(EVIDENCE) as evidence, archive.open(TWIN) as text:
         written = _limited(evidence, MAX_EVIDENCE_BYTES)
         if (count := written.count(b",") + written.count(b"[") + written.count(b"{")) > MAX_VALUES:
@@ -267,9 +270,11 @@ def _limited(stream: Any, limit: int) -> bytes:
 
 def files_of(machine: LoadedMachine) -> dict[str, str]:
     """Return the texts of twin and machine file, as bundles have them; raise ConfigurationError if one is missing."""
-    table = machine.file.twin
+    table, public = machine.file.twin, public_text(parse(read(machine.path)))
+    if (fmu := machine.twin.fmu) is not None:
+        return {FMU: f"The equations are in {Path(fmu.path).name}, SHA-256 {fmu.digest}\n", MACHINE: public}
     source = read(LIBRARY / f"{table.name}.toml" if table.file is None else machine.path.parent / table.file)
-    return {TWIN: source.text, MACHINE: public_text(parse(read(machine.path)))}
+    return {TWIN: source.text, MACHINE: public}
 
 
 def public_text(tables: Mapping[str, Any]) -> str:
@@ -277,7 +282,7 @@ def public_text(tables: Mapping[str, Any]) -> str:
     lines: list[str] = []
     for name, content in tables.items():
         for table in content if isinstance(content, list) else [content]:
-            own = {"file": TWIN} if name == "twin" else table
+            own = {"file": TWIN} if name == "twin" and "fmu" not in table else table
             lines.append(f"[[{toml_key(name)}]]" if isinstance(content, list) else f"[{toml_key(name)}]")
             keys = [key for key in own if key in PUBLIC_KEYS.get(name, own)]
             lines += [f"{toml_key(key)} = {toml_value(own[key])}" for key in keys]

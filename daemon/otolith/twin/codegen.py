@@ -15,9 +15,10 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
+from otolith.fmu.reference import FmuReference
 from otolith.twin.components import augmentation_inputs
 from otolith.twin.definition import Definition
-from otolith.twin.symbolic import COMPONENT_SLOPES, component, system_of
+from otolith.twin.symbolic import COMPONENT_SLOPES, FMU_TABLE, component, external, external_slope, system_of
 
 # Of functions that kernels alone call: code that lets Python and C call them takes a fifth of their compile time.
 INNER = "no_cpython_wrapper=True, no_cfunc_wrapper=True"
@@ -165,6 +166,8 @@ class KernelCode:
         self.u = [symbol.name for symbol in system.inputs]
         self.p = [symbol.name for symbol in system.parameters]
         self.settings = [symbol.name for symbol in system.settings]
+        self.fmu = definition.fmu
+        self._from_fmu = [] if self.fmu is None else [FMU_TABLE.name]
         self.y = numbered("y", len(system.outputs))
         self.ramps = [name for name, driven in zip(self.u, definition.inputs, strict=True) if driven.hold == "foh"]
         # dx/dt = f(x, u, p) and y = g(x, u, p): a = df/dx, b = df/dp, c = dg/dx, d = dg/dp.
@@ -190,7 +193,7 @@ class KernelCode:
             self._functions["linearise_sites_"] = [*self.rates, *of_sites[0], *of_sites[1]]
             self._functions["linearise_site_outputs_"] = [*outputs, *of_sites[2], *of_sites[3]]
         self._hoisted = hoist.assignments
-        self._constants = [*self.p, *self.settings, *hoist.names]
+        self._constants = [*self.p, *self.settings, *self._from_fmu, *hoist.names]
         self.blocks = self._shared_blocks()
 
     def functions(self) -> list[str]:
@@ -211,7 +214,11 @@ class KernelCode:
 
     def _function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
         """A function of states, inputs and constants; common subexpressions are computed once."""
+        # An FMU computes outputs on which components depend, and those enter its arguments.
+        before, expressions = ([], expressions) if self.fmu is None else _with_rows_of_fmu(expressions, self.fmu, "r")
         lines, expressions = _with_slopes_of_components(expressions)
+        after, expressions = ([], expressions) if self.fmu is None else _with_rows_of_fmu(expressions, self.fmu, "q")
+        lines = [*before, *lines, *after]
         shared, results = sympy.cse(expressions, symbols=sympy.numbered_symbols("t_", real=True), order="none")
         lines += [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
         returned = ", ".join(PRINTER.doprint(result) for result in results)
@@ -271,7 +278,8 @@ class KernelCode:
         return [*self._read_constants(row), *(f"{x} = initial[{row}{index}]" for index, x in enumerate(self.x))]
 
     def _read_constants(self, row: str) -> list[str]:
-        parameters = (f"{name} = parameters[{row}{index}]" for index, name in enumerate([*self.p, *self.settings]))
+        names = [*self.p, *self.settings, *self._from_fmu]
+        parameters = (f"{name} = parameters[{row}{index}]" for index, name in enumerate(names))
         return [*parameters, *self._hoisted]
 
     def input_increments(self, following: str) -> list[str]:
@@ -350,6 +358,72 @@ def _with_slopes_of_components(expressions: list[sympy.Expr]) -> tuple[list[str]
         kinds = (component, *COMPONENT_SLOPES)
         values |= {kind(*given): sympy.Symbol(name, real=True) for kind, name in zip(kinds, names, strict=True)}
     return lines, [expression.xreplace(values) for expression in expressions]
+
+
+def _with_rows_of_fmu(
+    expressions: list[sympy.Expr], fmu: FmuReference, prefix: str
+) -> tuple[list[str], list[sympy.Expr]]:
+    """Lines that evaluate an FMU once for each set of arguments that depends on no other set; what is left.
+
+    Each row and slope that occurs is read from its buffer after that, into a variable that begins with ``prefix``.
+    """
+    occurring = set().union(*(expression.atoms(external, external_slope) for expression in expressions))
+    occurring = {part for part in occurring if not any(each.has(external, external_slope) for each in part.args)}
+    given, width = sorted({_of_fmu(part) for part in occurring}, key=str), len(fmu.arguments)
+    lines: list[str] = []
+    values: dict[sympy.Expr, sympy.Symbol] = {}
+    for index, arguments in enumerate(given):
+        own = sorted((part for part in occurring if _of_fmu(part) == arguments), key=str)
+        rows, slopes = f"{prefix}_{index}", f"{prefix}s_{index}"
+        given_to = ", ".join(map(PRINTER.doprint, arguments))
+        if columns := {int(part.args[1]) for part in own if isinstance(part, external_slope)}:
+            lines.append(f"{rows}, {slopes} = fmu_slopes_({_groups(fmu, columns)}, {given_to})")
+        else:
+            lines.append(f"{rows} = fmu_rows_({given_to})")
+        for part in own:
+            row = int(part.args[0])
+            if isinstance(part, external_slope):
+                column = int(part.args[1])
+                name, place = f"{slopes}_{row}_{column}", f"{slopes} + {8 * (row * width + column)}"
+                lines.append(f"{name} = load_real({place}) * fmu_scale_{row} * fmu_share_{column}")
+            else:
+                name = f"{rows}_{row}"
+                lines.append(f"{name} = load_real({rows} + {8 * row}) * fmu_scale_{row}")
+            values[part] = sympy.Symbol(name, real=True)
+    return lines, [expression.xreplace(values) for expression in expressions]
+
+
+def _groups(fmu: FmuReference, columns: set[int]) -> str:
+    """Return the groups of arguments by which derivatives are needed, in the words of ``otolith.fmu.calls``."""
+    states, known = len(fmu.states), len(fmu.states) + len(fmu.inputs)
+    ranges = {"OF_STATES": range(states), "OF_INPUTS": range(states, known)}
+    ranges["OF_PARAMETERS"] = range(known, len(fmu.arguments))
+    return " + ".join(name for name, group in ranges.items() if columns & {*group})
+
+
+def _of_fmu(part: sympy.Expr) -> tuple[sympy.Expr, ...]:
+    """Return table and arguments of a row or slope."""
+    first = 2 if isinstance(part, external_slope) else 1
+    return tuple(part.args[first:])
+
+
+def functions_of_fmu(fmu: FmuReference) -> list[str]:
+    """``fmu_rows_`` and ``fmu_slopes_``: they set the arguments in the FMU's units and return where the results are."""
+    names = "ARGUMENTS_AT, OF_INPUTS, OF_PARAMETERS, OF_STATES, ROWS_AT, SLOPES_AT, differentiate, entry, evaluate"
+    lines = [f"from otolith.fmu.calls import {names}, load_real, store_real", ""]
+    lines += [f"fmu_scale_{row} = {item.scale!r}" for row, item in enumerate(fmu.rows)]
+    lines += [f"fmu_share_{column} = {1.0 / item.scale!r}" for column, item in enumerate(fmu.arguments)]
+    given = numbered("a", len(fmu.arguments))
+    for function, evaluation, results in (
+        ("fmu_rows_(", "evaluate(table)", "entry(table, ROWS_AT)"),
+        ("fmu_slopes_(groups, ", "differentiate(table, groups)", "entry(table, ROWS_AT), entry(table, SLOPES_AT)"),
+    ):
+        body = ["table = int(fmu)", "arguments = entry(table, ARGUMENTS_AT)"]
+        body += [f"store_real(arguments + {8 * at}, {name} * fmu_share_{at})" for at, name in enumerate(given)]
+        body += [evaluation, f"return {results}"]
+        head = f"def {function}fmu, {', '.join(given)}):"
+        lines += ["", "", f'@njit(error_model="numpy", {INNER})', head, *indent(body)]
+    return [*lines, "", ""]
 
 
 def fill(template: str, blocks: Blocks) -> list[str]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from otolith.fmu.reference import FmuReference
+
 
 class Role(StrEnum):
     """Where the value of a parameter comes from, in the paper's words."""
@@ -126,6 +128,7 @@ class Definition:
     sites: tuple[Site, ...] = ()
     performance: tuple[Figure, ...] = ()
     base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.components)
+    fmu: FmuReference | None = None  # What computes the right sides that are written ``fmu(...)``
 
     def __hash__(self) -> int:
         """Of the name alone, as what is prepared once for a twin is looked up several times in each window."""

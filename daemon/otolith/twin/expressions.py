@@ -34,7 +34,10 @@ FUNCTIONS: dict[str, int] = {
 }  # fmt: skip
 """Every function and its number of arguments."""
 
-RESERVED = frozenset({*FUNCTIONS, "t", "der", "pi", "Piecewise"})
+FMU = "fmu"
+"""Function of a number and all arguments of an FMU: that row of its rates and outputs, a right side by itself."""
+
+RESERVED = frozenset({*FUNCTIONS, FMU, "t", "der", "pi", "Piecewise"})
 ARITHMETIC: dict[type[ast.operator], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: operator.pow,
@@ -197,7 +200,18 @@ def _children(node: ast.AST, column: int) -> list[ast.expr]:
             raise ExpressionError(f"{_kind_of(node)} is not allowed", column)
 
 
+def row_of_fmu(tree: ast.expr) -> int | None:
+    """Return the number of the row of an FMU that a right side is; None if it is an expression."""
+    match tree:
+        case ast.Call(func=ast.Name(id=name), args=[ast.Constant(value=int(row)), *_]) if name == FMU:
+            return row
+        case _:
+            return None
+
+
 def _arguments(name: str, arguments: list[ast.expr], column: int) -> list[ast.expr]:
+    if name == FMU:
+        return arguments
     if name not in FUNCTIONS:
         raise ExpressionError(f"{name!r} is not a function of the language: {', '.join(sorted(FUNCTIONS))}", column)
     if len(arguments) != FUNCTIONS[name]:
@@ -347,6 +361,10 @@ def _tidy(dimension: Dimension) -> Dimension:
 
 
 def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) -> Dimension:
+    if name == FMU:  # not within an expression: it is the whole right side of a twin that an FMU computes
+        raise ExpressionError(
+            f"{name!r} is not a function of the language", arguments[0].col_offset if arguments else 1
+        )
     if name == "where":
         condition = arguments[0]
         assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser refuses anything else

@@ -208,6 +208,10 @@ class Kernel:
         if columns is None:
             of_parameters = len(self.definition.parameters) - self.definition.settings
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
+        if self._fmu is not None:
+            first = len(self.definition.parameters) - self.definition.settings
+            of_drifts = first + len(self.definition.states)
+            self._fmu.want({column - of_drifts if column >= of_drifts else column for column in columns})
         drive = (*excitation.arguments, excitation.grid.before_last, np.array(columns, dtype=np.int64))
         return Sensitivities(*self._call("sensitivities", parameters, initial, *drive))
 
@@ -338,10 +342,26 @@ class Kernel:
         return count
 
     @cached_property
+    def _fmu(self) -> Any:
+        if self.definition.fmu is None:
+            return None
+        from otolith.fmu.instance import instance_of  # noqa: PLC0415 - loads Numba, which the daemon does not need
+
+        return instance_of(self.definition.fmu)
+
+    @cached_property
     def _module(self) -> Any:
         return kernel_cache.load(identity_of(self.definition), lambda: _source(self.definition))
 
     def _call(self, name: str, first: Array, second: Array, *rest: Any) -> Any:
+        if self._fmu is None or name in SHARED:
+            return self._called(name, first, second, *rest)
+        table = np.full((*first.shape[:-1], 1), self._fmu.address)
+        result = self._called(name, np.concatenate([first, table], axis=-1), second, *rest)
+        self._fmu.recover()
+        return result
+
+    def _called(self, name: str, first: Array, second: Array, *rest: Any) -> Any:
         module, compiled = (_shared_module(), _shared_compiled) if name in SHARED else (self._module, self._compiled)
         function: Callable[..., Any] = getattr(module, name)
         arguments = (np.ascontiguousarray(first), np.ascontiguousarray(second), *rest)
@@ -383,6 +403,11 @@ def identity_of(definition: Definition) -> str:
         [(name, expression) for name, expression, _ in definition.definitions],
         definition.equations,
         None if definition.base is None else [astuple(site) for site in definition.sites],
+        *(
+            ()
+            if definition.fmu is None
+            else [[item.scale for item in (*definition.fmu.arguments, *definition.fmu.rows)]]
+        ),
     )
     return hashlib.sha256(repr(mathematical).encode()).hexdigest()
 

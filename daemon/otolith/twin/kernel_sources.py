@@ -5,7 +5,18 @@ it, which :mod:`otolith.twin.expressions` has checked. The theory is in docs/exp
 predictor line by line, ``sensitivities.md`` derives the sensitivities, ``innovation-form.md`` the filter.
 """
 
-from otolith.twin.codegen import INNER, PRINTER, STAGES, Blocks, KernelCode, fill, numbered, total, unpacked
+from otolith.twin.codegen import (
+    INNER,
+    PRINTER,
+    STAGES,
+    Blocks,
+    KernelCode,
+    fill,
+    functions_of_fmu,
+    numbered,
+    total,
+    unpacked,
+)
 from otolith.twin.component_kernels import component_functions, kernels_of_all_twins, linearise
 from otolith.twin.definition import Definition
 
@@ -450,8 +461,12 @@ def kernel_source(definition: Definition) -> str:
     lines = [*fill(COVARIANCE_STEPS, {"inner": INNER}), *blank]
     if definition.base is not None:
         lines += component_functions()
+    if code.fmu is not None:
+        lines += functions_of_fmu(code.fmu)
     lines += [*code.functions(), *advance(code), *blank, *simulate(code), *blank]
-    lines += [*sensitivities(code), *blank, *kalman(code), *blank, *euler(code), *blank, *ensemble(code)]
+    lines += [*sensitivities(code), *blank, *kalman(code), *blank, *ensemble(code)]
+    if code.fmu is None:  # the difference equations of the paper are those of written equations
+        lines += [*blank, *euler(code)]
     if definition.base is not None:
         lines += [*blank, *linearise(code)]
     return HEAD + "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ import numpy as np
 from otolith.acquisition.window import Array
 from otolith.twin.components import UNBOUNDED
 from otolith.twin.definition import Definition
-from otolith.twin.expressions import evaluate, names_in, parse, terms
+from otolith.twin.expressions import evaluate, names_in, parse, row_of_fmu, terms
 from otolith_drivers.units import to_base
 
 
@@ -62,7 +62,8 @@ def _evaluated(
     values |= {fixed.name: [np.array([fixed.value * scales[fixed.name]])] for fixed in base.constants}
     with np.errstate(all="ignore"):
         for name, tree in ordered:
-            values[name] = terms(tree, values)
+            row = row_of_fmu(tree)
+            values[name] = terms(tree, values) if row is None else [_of_fmu(base, tree, values)[row]]
             if entered is None or entered.into != name:
                 continue
             if entered.mode == "multiplicative":
@@ -71,6 +72,16 @@ def _evaluated(
                 through, scale = _entrance(base, site)
                 values[name] = [*values[name], evaluate(through, values) * entering * scale]
     return values, scales
+
+
+def _of_fmu(base: Definition, tree: ast.expr, values: Mapping[str, list[Array]]) -> Array:
+    """Return what the FMU of a twin computes (rows, records) from the arguments of a call, in coherent units."""
+    if base.fmu is None or not isinstance(tree, ast.Call):
+        raise ValueError(f"twin {base.name!r} has no FMU")
+    from otolith.fmu.instance import instance_of  # noqa: PLC0415 - loads Numba, which the daemon does not need
+
+    columns = np.broadcast_arrays(*(evaluate(argument, values) for argument in tree.args[1:]))
+    return np.asarray(instance_of(base.fmu).rows(np.column_stack(columns)).T)
 
 
 def _rows(summands: list[Array], scale: float) -> Array:

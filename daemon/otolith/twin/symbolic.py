@@ -24,7 +24,7 @@ from otolith.twin.components import (
     sources,
 )
 from otolith.twin.definition import Definition, Site
-from otolith.twin.expressions import ARITHMETIC, constant, parse
+from otolith.twin.expressions import ARITHMETIC, constant, parse, row_of_fmu
 from otolith_drivers.units import to_base
 
 Values = Mapping[str, sympy.Expr]  # The expression of each name
@@ -79,7 +79,23 @@ class component_c(component):  # noqa: N801 - sympy has no types; the class name
     """Derivative of a component by its phase."""
 
 
+class external(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
+    """``external(row, table, ...)``: that row of what an FMU computes from all that follows, in coherent units."""
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """The derivative by an argument of the FMU; neither the row nor the table has one."""
+        row, *rest = self.args
+        return external_slope(row, sympy.Integer(argindex - FIRST_ARGUMENT), *rest)
+
+
+class external_slope(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
+    """``external_slope(row, column, table, ...)``: the derivative of that row by that argument."""
+
+
 TIME = sympy.Symbol("t")
+FMU_TABLE = sympy.Symbol("fmu", real=True)
+"""The address of the table by which kernels call an FMU; no name of a definition lacks a prefix."""
+FIRST_ARGUMENT = 3  # of ``external``, counted from 1
 COMPONENT_SLOPES = (component_x, component_a, component_b, component_c)
 COMPARISONS = {ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge}
 SYMPY_FUNCTIONS = {
@@ -225,6 +241,8 @@ def to_sympy(tree: ast.expr, values: Values) -> sympy.Expr:
             left, right = to_sympy(condition.left, values), to_sympy(condition.comparators[0], values)
             test = COMPARISONS[type(condition.ops[0])](left, right)
             return sympy.Piecewise((to_sympy(then, values), test), (to_sympy(otherwise, values), True))
+        case ast.Call(args=[ast.Constant(), *arguments]) if (row := row_of_fmu(tree)) is not None:
+            return external(sympy.Integer(row), FMU_TABLE, *(to_sympy(argument, values) for argument in arguments))
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return SYMPY_FUNCTIONS[name](*(to_sympy(argument, values) for argument in arguments))
         case _:

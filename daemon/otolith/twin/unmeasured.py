@@ -201,6 +201,8 @@ class _Frictions:
     """The speed that an input acts on, and the parameters of a twin that act as friction at the same place."""
 
     def __init__(self, definition: Definition, driven: Input) -> None:
+        if definition.fmu is not None:
+            raise ValueError(f'which friction the FMU has is not known: write {driven.name} = {{ unknown = "slow" }}')
         self._definition = definition
         effects = self._effect(driven.name, driven.low, driven.high)
         acting = [row for row, effect in zip(definition.states, effects, strict=True) if effect.any()]

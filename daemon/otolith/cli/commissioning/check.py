@@ -10,6 +10,8 @@ from pathlib import Path
 
 from otolith.cli.common import progress_line
 from otolith.cli.terminal import echo, echo_json
+from otolith.fmu.description import read_fmu
+from otolith.fmu_twin import TUNABLE
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
@@ -17,6 +19,7 @@ from otolith.runtime.preview import preview_lines, preview_recording
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.identifiability import structural_identifiability
 from otolith_drivers.base import Link, Sample
+from otolith_drivers.errors import some_names
 from otolith_drivers.user_dirs import check_writable
 
 # Engineering choices, guarded by tests/cli/test_check.py.
@@ -41,6 +44,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
         OtolithError: anything that would keep the daemon from starting.
     """
     machine = load_machine(path, for_replay=not with_device)
+    machine.try_fmu()
     for line in describe(machine):
         echo(line)
     if machine.file.recording.enabled:
@@ -63,6 +67,7 @@ def check_data(path: Path, data: Sequence[Path], *, as_json: bool) -> bool:
         OtolithError: a file that cannot be used.
     """
     machine = load_machine(path, with_driver=False)
+    machine.try_fmu()
     with progress_line("reading", enabled=not as_json) as show:
         preview = preview_recording(machine, data, progress=show)
     if as_json:
@@ -83,8 +88,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     file, problem, twin = machine.file, machine.problem, machine.twin
     lines = [
         f"machine {file.machine.name} at {file.machine.site}, twin {twin.name}: {twin.title}",
-        *(f"  {name} = {text}" for name, text, _ in twin.definitions),
-        *(f"  {left} = {right}" for left, right in twin.equations),
+        *(equations(twin) if twin.fmu is None else of_fmu(machine)),
         *(machine.driver.describe() if machine.built_driver else sources),
         *without_sensors(machine),
         *_delays(machine),
@@ -118,6 +122,43 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         f"reports on {', '.join(endpoints) or 'no endpoint'}, keys {prefix(file.machine.site, file.machine.name)}/..."
     )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
+    return lines
+
+
+def equations(twin: Definition) -> list[str]:
+    """Return the lines of definitions and equations."""
+    rows = [(name, text) for name, text, _ in twin.definitions] + [*twin.equations]
+    return [f"  {left} = {right}" for left, right in rows]
+
+
+def of_fmu(machine: LoadedMachine) -> list[str]:
+    """Return what the FMU of a twin offers; it is tried before.
+
+    Raises:
+        ConfigurationError: the FMU cannot be used.
+    """
+    fmu, trial, twin = machine.twin.fmu, machine.try_fmu(), machine.complete
+    if fmu is None or trial is None:
+        return []
+    offered = read_fmu(Path(fmu.path))
+    kind = "model exchange" if fmu.is_model else "co-simulation, whose derivatives are read at start values"
+    slopes = "its own directional derivatives by states and inputs" if fmu.has_slopes else "central differences"
+    took = f"{1e6 * trial.seconds:.2g} µs for each value"
+    lines = [
+        f"  equations in {Path(fmu.path).name}: FMI {fmu.version}.0, {kind}; {took}",
+        f"  sensitivities by {slopes}; its state is set for each value, so nothing of it is saved",
+    ]
+    units = twin.units()
+    for name, rows in (("states", twin.states), ("inputs", twin.inputs), ("outputs", twin.outputs)):
+        lines.append(f"  {name}: {', '.join(f'{row.name} ({units[row.name]})' for row in rows)}")
+    unused = [row.name for row in offered.of("parameter", TUNABLE) if row.name not in {p.name for p in fmu.parameters}]
+    lines += [f"  not used, so they keep their values: {some_names(unused)}"] if unused else []
+    fixed = [row.name for row in offered.of("parameter", "fixed")]
+    lines += [f"  fixed, so they cannot be estimated: {some_names(fixed)}"] if fixed else []
+    for rate, state in trial.integrals:
+        if (rate, state) not in fmu.integrals:
+            position, speed = twin.states[rate].name, twin.states[state].name
+            lines.append(f'  ! {position} integrates {speed}: write derivative = "{speed}" there in [twin.variables]')
     return lines
 
 

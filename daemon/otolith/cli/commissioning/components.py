@@ -198,4 +198,5 @@ def loaded(file: Path) -> "tuple[LoadedMachine, StateStore]":
 
     use_state_of_service(file)
     machine = load_machine(file, with_driver=False)
+    machine.try_fmu()
     return machine, store_of(machine)

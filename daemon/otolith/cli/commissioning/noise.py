@@ -42,6 +42,7 @@ def noise(file: Path, data: tuple[Path, ...], windows: int, as_json: bool) -> No
     from otolith.machine import load_machine
 
     machine = load_machine(file, with_driver=False)
+    machine.try_fmu()
     record = identified_record(machine, HealthyLog(data), windows)
     if as_json:
         echo_json(_document(machine, record), indent=2)

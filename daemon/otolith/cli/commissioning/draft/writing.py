@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from otolith.cli.commissioning.draft.offers import Offer
-from otolith.machine import MAX_WINDOW_RECORDS, MIN_WINDOW_RECORDS
-from otolith.runtime.preview import whole_length
+from otolith.machine_file import MAX_WINDOW_RECORDS, MIN_WINDOW_RECORDS, whole_length
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith_drivers.grammars.toml_lines import toml_comment, toml_key, toml_value
 from otolith_drivers.units import factor

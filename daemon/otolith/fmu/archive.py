@@ -1,0 +1,172 @@
+"""An FMU on disk: an archive from outside, checked before anything of it is used, and unpacked into the cache.
+
+Only its description is read until a process has to evaluate it. Its binaries and resources are then unpacked into a
+folder of this user alone, by the digest of the archive: a file that was changed meanwhile is refused.
+"""
+
+import hashlib
+import io
+import os
+import platform
+import re
+import shutil
+import stat
+import tempfile
+import zipfile
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from otolith.fmu.reference import FmuReference
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.outside_text import visible
+from otolith_drivers.user_dirs import cache_directory
+
+# Limits keep memory and disk from hostile archives; docs/reference/thresholds-twin.md.
+MAX_ARCHIVE_BYTES = 256 << 20
+MAX_UNPACKED_BYTES = 1 << 30
+MAX_MEMBERS = 20_000
+MAX_DESCRIPTION_BYTES = 32 << 20
+MAX_RATIO, RATIO_BYTES = 200.0, 16 << 20  # of unpacked to packed bytes, for members above that size
+KEPT = 8  # unpacked archives, the latest
+DESCRIPTION = "modelDescription.xml"
+USED = ("binaries/", "resources/")
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
+READ_ERRORS = (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError)
+
+
+class FmuArchive(NamedTuple):
+    """A checked archive."""
+
+    path: Path
+    digest: str
+    names: frozenset[str]
+    description: bytes
+
+
+def read_archive(path: Path) -> FmuArchive:
+    """Return a checked archive; raise ValueError with the reason for which it is refused."""
+    return _checked(path, _content(path))
+
+
+def _checked(path: Path, content: bytes) -> FmuArchive:
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+            _check_members(members)
+            names = frozenset(member.filename for member in members)
+            if DESCRIPTION not in names:
+                raise ValueError(f"has no {DESCRIPTION}, so it is no FMU")
+            size = archive.getinfo(DESCRIPTION).file_size
+            if size > MAX_DESCRIPTION_BYTES:
+                raise ValueError(
+                    f"{DESCRIPTION} has {size >> 20} MB: at most {MAX_DESCRIPTION_BYTES >> 20} MB are read"
+                )
+            description = archive.read(DESCRIPTION)
+    except READ_ERRORS as error:
+        raise ValueError(_reason(error)) from error
+    return FmuArchive(path, hashlib.sha256(content).hexdigest(), names, description)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        if not path.is_file():
+            raise ValueError("no such file" if not path.exists() else "is no file")
+        if (size := path.stat().st_size) > MAX_ARCHIVE_BYTES:
+            raise ValueError(f"has {size >> 20} MB: an FMU may have {MAX_ARCHIVE_BYTES >> 20} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, zipfile.BadZipFile):
+        return f"is no archive, or a damaged one: {visible(str(error), 200)}"
+    return visible(str(error), 300) or type(error).__name__
+
+
+def _check_members(members: list[zipfile.ZipInfo]) -> None:
+    """Raise ValueError if an archive would write outside of its folder, or more than a disk should take."""
+    if len(members) > MAX_MEMBERS:
+        raise ValueError(f"has {len(members)} members: at most {MAX_MEMBERS} are unpacked")
+    seen = set[str]()
+    for member in members:
+        name, shown = member.filename, repr(visible(member.filename, 80))
+        parts = PurePosixPath(name).parts
+        if not name or name.startswith("/") or ".." in parts or re.search(r"[\\:\x00-\x1f]", member.orig_filename):
+            raise ValueError(f"its member {shown} leads out of its folder")
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise ValueError(f"its member {shown} is a link")
+        if name in seen:
+            raise ValueError(f"its member {shown} is in it twice")
+        if member.flag_bits & 1:
+            raise ValueError(f"its member {shown} is encrypted")
+        if member.file_size > max(RATIO_BYTES, MAX_RATIO * member.compress_size):
+            packed = f"{member.compress_size} bytes packed"
+            raise ValueError(f"its member {shown} has {member.file_size >> 20} MB, {packed}: a bomb")
+        seen.add(name)
+    if (total := sum(member.file_size for member in members)) > MAX_UNPACKED_BYTES:
+        raise ValueError(f"has {total >> 20} MB unpacked: at most {MAX_UNPACKED_BYTES >> 20} MB are unpacked")
+
+
+def check_binary(archive: FmuArchive, version: str, identifier: str) -> None:
+    """Raise ValueError if the archive has no binary of that name for this computer."""
+    if not IDENTIFIER.fullmatch(identifier):
+        raise ValueError(f"its modelIdentifier {visible(identifier, 80)!r} is no name in C")
+    wanted = f"binaries/{platform_name(version)}/{identifier}.so"
+    if wanted not in archive.names:
+        parts = (PurePosixPath(name).parts for name in archive.names)
+        others = sorted({part[1] for part in parts if len(part) > 2 and part[0] == "binaries"})
+        has = f"it has {', '.join(visible(name, 40) for name in others[:8])}" if others else "it has none"
+        raise ValueError(f"has no binary for this computer, {wanted}: {has}: export it for Linux, or compile it there")
+
+
+def platform_name(version: str) -> str:
+    """Return what the standard calls this computer."""
+    machine = platform.machine()
+    return "linux64" if version == "2" and machine == "x86_64" else f"{machine}-linux"
+
+
+def unpacked(reference: FmuReference) -> Path:
+    """Return the folder with binaries and resources of an FMU.
+
+    Raises:
+        ConfigurationError: the archive was changed since its description was read.
+        ServiceError: the cache cannot be used.
+    """
+    store = cache_directory("fmus")
+    folder = store / reference.digest
+    if not folder.is_dir():
+        path = Path(reference.path)
+        try:
+            archive = _checked(path, content := _content(path))
+        except ValueError as error:
+            raise ConfigurationError(f"{reference.path}: {error}") from error
+        if archive.digest != reference.digest:
+            raise ConfigurationError(f"{reference.path}: was changed since it was checked: start again")
+        temporary = Path(tempfile.mkdtemp(prefix="new-", dir=store))
+        try:
+            _unpack(content, temporary)
+            if not folder.is_dir():
+                temporary.rename(folder)
+        except OSError as error:
+            if not folder.is_dir():  # another process has unpacked it
+                raise ConfigurationError(f"{reference.path}: cannot be unpacked: {error.strerror}") from error
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+        _remove_old(store, folder)
+    os.utime(folder)
+    return folder
+
+
+def _unpack(content: bytes, folder: Path) -> None:
+    with zipfile.ZipFile(io.BytesIO(content)) as opened:
+        for member in opened.infolist():
+            if member.filename.startswith(USED) and not member.is_dir():
+                opened.extract(member, folder)
+
+
+def _remove_old(store: Path, keep: Path) -> None:
+    folders = sorted((path for path in store.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
+    for folder in folders[:-KEPT]:
+        if folder != keep and not folder.name.startswith("new-"):
+            shutil.rmtree(folder, ignore_errors=True)
