@@ -18,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from otolith.health.limits import Level
 from otolith.health.schema import Status
 from otolith.publishing.zenoh_session import session
-from otolith.site.app import MAX_LIVE, MAX_QUERY
+from otolith.site.app import MAX_LIVE, MAX_QUERY, REFRESH
 from tests.hostile import HOSTILE
 from tests.sites.machines import Daemon, Stranger, daemons, own_endpoint, raised, report_of, sent
 from tests.sites.serving import Served, serving
@@ -125,7 +125,9 @@ def test_a_filter_lets_through_what_it_says(site: Served, query: str, shown: set
 
 
 def test_a_machine_has_its_report_page_with_its_past(site: Served) -> None:
-    page = site.ask(f"/machine/{SITE}/{FAULTY}?time=1h").text
+    answer = site.ask(f"/machine/{SITE}/{FAULTY}?time=1h")
+    page = answer.text
+    assert float(answer.headers["refresh"]) == REFRESH
     for needle in ("ACT", "short circuit between turns", "measure resistance", "R_a", "polyline"):
         assert needle in page
     assert len(re.findall(r"<polyline[^>]*points=\"([^\"]*)\"", page)[0].split()) > 20

@@ -1,5 +1,6 @@
 """A history made of the reports and events of a machine that were received, for a report page without its database."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -25,9 +26,13 @@ class ReceivedHistory:
         return list(reversed(self._reports[-count:]))
 
     def states(self, since: float) -> list[PartState]:
-        """Return the states of the parts in the order in which they were entered."""
+        """Return the states of the parts in the order in which they were entered.
+
+        Between two reports there may be others: a state was entered after the one without it.
+        """
         known: dict[str, Level] = {}
         entered = []
+        before = math.inf  # End of the report before
         for report in self._reports:
             parts: dict[str, PartDocument] = {"": report.health, **report.health.parts} if report.health else {}
             shown = {name: (part.state, part.since) for name, part in parts.items()}
@@ -35,7 +40,9 @@ class ReceivedHistory:
             for name, (state, begun) in shown.items():
                 if known.get(name) is not state:
                     known[name] = state
-                    entered.append(PartState(name, report.window.end, begun, state))
+                    first = min(max(before, begun), report.window.end)
+                    entered.append(PartState(name, first, begun, state))
+            before = report.window.end
         return [row for row in entered if row.entered >= since]
 
     def events(self, since: float) -> list[EventDocument]:

@@ -32,6 +32,7 @@ from otolith.site.words import accepted, words_in
 MAX_LIVE = 64  # browsers that get live events at a time
 TICK = 1.0  # s between two looks for what has changed
 SEND_TIMEOUT = 10.0  # s that a slow reader may take for one event
+REFRESH = 30  # s after which a browser asks for the page of a machine again
 MAX_LOOKING = 4  # pages of the past of machines that are made at a time
 MAX_QUERY = 512  # characters of the query of an address
 FIRST_SISTERS = 8  # machines of a parameter that are seen at once, with those that differ
@@ -177,7 +178,8 @@ class SitePages:
         head = PAGES.get_template("spans.html").render(
             site=site, machine=name, spans=SPANS, span=span if span in SPANS else "1h", **self._frame(language)
         )
-        return HTMLResponse(page.replace("<header>", f"{head}<header>", 1), headers={OWN_POLICY: REPORT_POLICY})
+        headers = {OWN_POLICY: REPORT_POLICY, "refresh": f"{REFRESH}"}
+        return HTMLResponse(page.replace("<header>", f"{head}<header>", 1), headers=headers)
 
     async def _show_nothing(self, request: Request, _: Exception) -> Response:
         return self._message(self._language(request), "not_found", 404)
