@@ -22,6 +22,7 @@ from otolith.health.schema import CostDocument, DriverDocument
 from otolith.site.known import Knowledge
 from otolith.site.metrics import exposition
 from otolith.site.outlets.runner import OutletStatus
+from otolith.site.outlets.table import OUTLETS
 from otolith.site.settings import SiteFile
 from tests.conftest import free_port
 from tests.hostile import HOSTILE
@@ -109,9 +110,7 @@ def test_the_example_of_a_site_is_one() -> None:
     SiteFile.model_validate(tomllib.loads(text))
     whole = re.sub(r"^# (?=[\[\w]+(?: =|\.|\]))", "", text, flags=re.MULTILINE)
     every = SiteFile.model_validate(tomllib.loads(whole))
-    assert every.outlets.mqtt is not None
-    assert every.outlets.mail is not None
-    assert every.outlets.webhook is not None
+    assert all(getattr(every.outlets, name) is not None for name in OUTLETS)
 
 
 def test_panels_of_the_dashboard_cover_no_other_and_ask_the_chosen_source() -> None:

@@ -10,24 +10,11 @@ from otolith.health.schema import Language
 from otolith.machine_file import Endpoint, check_name
 from otolith.publishing.zenoh_config import Connection, Credentials
 from otolith.site.known import MAX_MACHINES
-from otolith.site.outlets.options import OutletsTable
+from otolith.site.outlets.options import Address, OutletsTable
 from otolith_drivers.common.time_zones import check_time_zone
 from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
 
 OWN_HOSTS = ("localhost", "127.0.0.1", "::1")
-
-
-def _address(text: str) -> str:
-    """Return ``text``, or raise ValueError if it is no address with a port."""
-    host, _, port = text.rpartition(":")
-    try:
-        ipaddress.ip_address(host.strip("[]"))
-        is_port = port.isdecimal() and 0 < int(port) < 65_536
-    except ValueError:
-        is_port = False
-    if not is_port:
-        raise ValueError(f'{text!r} is no address with a port: write it like "127.0.0.1:8420" or "[::1]:8420"')
-    return text
 
 
 def _identity(text: str) -> str:
@@ -44,7 +31,7 @@ def _identity(text: str) -> str:
 class HttpTable(StrictModel):
     """Where browsers reach the site."""
 
-    listen: Annotated[str, AfterValidator(_address)] = "127.0.0.1:8420"
+    listen: Address = "127.0.0.1:8420"
     hosts: tuple[str, ...] = ()  # Names by which browsers reach it, beside those of this computer for itself
 
     @property

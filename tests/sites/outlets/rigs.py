@@ -8,10 +8,11 @@ import socket
 import socketserver
 import threading
 from abc import ABC, abstractmethod
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from asyncua.sync import Client
 from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 
@@ -25,11 +26,15 @@ class Rig(ABC):
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.port = folder, free_port(socket.SOCK_STREAM)
-        self._stack = ExitStack()
+        self._stack, self.is_started = ExitStack(), False
 
     @abstractmethod
     def table(self) -> str:
         """The lines of its table in the file of a site."""
+
+    def prevent(self) -> None:
+        """Keep the outlet from passing anything on until :meth:`start`."""
+        assert not self.is_started  # who has not started does so by itself
 
     @abstractmethod
     def start(self) -> None:
@@ -173,6 +178,39 @@ class MqttRig(Rig):
         return [(row["machine"], row["told"]) for row in own]
 
 
+class OpcuaRig(Rig):
+    """A client that reads: events come to those who have subscribed them, which has a test of its own."""
+
+    _held: socket.socket | None = None
+
+    def table(self) -> str:
+        return f'listen = "127.0.0.1:{self.port}"'
+
+    def prevent(self) -> None:
+        self._held = socket.create_server(("127.0.0.1", self.port))
+
+    def start(self) -> None:
+        if self._held is not None:
+            self._held.close()
+
+    def client(self) -> Client:
+        """A client, not connected."""
+        return Client(f"opc.tcp://127.0.0.1:{self.port}/otolith/")
+
+    def states(self) -> dict[str, str]:
+        found = {}
+        with suppress(OSError), self.client() as client:  # it may not listen yet
+            index = client.get_namespace_index("urn:otolith:site")
+            for area in client.nodes.objects.get_child(f"{index}:Otolith").get_children():
+                for machine in area.get_children():
+                    state = machine.get_child(f"{index}:State").read_value()
+                    found[machine.read_browse_name().Name] = state
+        return found
+
+    def events(self) -> None:
+        return None
+
+
 def _serve(server: socketserver.TCPServer, stack: ExitStack) -> None:
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
@@ -181,4 +219,4 @@ def _serve(server: socketserver.TCPServer, stack: ExitStack) -> None:
     stack.callback(server.shutdown)
 
 
-RIGS: dict[str, type[Rig]] = {"mqtt": MqttRig, "webhook": WebhookRig, "mail": MailRig}
+RIGS: dict[str, type[Rig]] = {"mqtt": MqttRig, "webhook": WebhookRig, "mail": MailRig, "opcua": OpcuaRig}

@@ -1,5 +1,6 @@
 """The tables ``[outlets.*]`` of the file of a site. Files are named relative to it."""
 
+import ipaddress
 from pathlib import Path
 from typing import Annotated, Self
 from urllib.parse import urlsplit
@@ -12,6 +13,19 @@ from otolith_drivers.config_files import StrictModel
 
 PerHour = Annotated[int, Field(ge=1, le=3600)]
 Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+def _address(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no address with a port."""
+    host, _, port = text.rpartition(":")
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+        is_port = port.isdecimal() and 0 < int(port) < 65_536
+    except ValueError:
+        is_port = False
+    if not is_port:
+        raise ValueError(f'{text!r} is no address with a port: write it like "127.0.0.1:8420" or "[::1]:8420"')
+    return text
 
 
 def _topic(text: str) -> str:
@@ -37,6 +51,7 @@ def _mail_address(text: str) -> str:
     return text
 
 
+Address = Annotated[str, AfterValidator(_address)]
 Topic = Annotated[str, AfterValidator(_topic)]
 MailAddress = Annotated[str, AfterValidator(_mail_address)]
 
@@ -95,9 +110,24 @@ class MailOutlet(NoticeOptions):
         return self
 
 
+class OpcuaOutlet(NoticeOptions, CredentialOptions):
+    """``[outlets.opcua]``: a server for HMI and SCADA."""
+
+    listen: Address = "127.0.0.1:4840"
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        is_open = not ipaddress.ip_address(self.listen.rpartition(":")[0].strip("[]")).is_loopback
+        if is_open and (self.certificate is None or self.user is None):
+            keys = "certificate, key, user and password_file"
+            raise ValueError(f"listen = {self.listen!r} is for other computers: set {keys}")
+        return self
+
+
 class OutletsTable(StrictModel):
     """``[outlets]``: each table is one outlet. ``/metrics`` for Prometheus is always there."""
 
     mqtt: MqttOutlet | None = None
     webhook: WebhookOutlet | None = None
     mail: MailOutlet | None = None
+    opcua: OpcuaOutlet | None = None

@@ -34,6 +34,7 @@ OUTLETS = {
     "mqtt": OutletKind("otolith.site.outlets.mqtt", "paho", "mqtt"),
     "webhook": OutletKind("otolith.site.outlets.webhook"),
     "mail": OutletKind("otolith.site.outlets.mail"),
+    "opcua": OutletKind("otolith.site.outlets.opcua", "asyncua", "opcua"),
 }
 
 
