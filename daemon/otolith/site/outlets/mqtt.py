@@ -1,5 +1,6 @@
 """States, parameters and events as JSON over MQTT, with the discovery of Home Assistant. It subscribes to nothing."""
 
+import contextlib
 import re
 import ssl
 import threading
@@ -24,6 +25,7 @@ from otolith_drivers.outside_text import visible
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 CONNECT_TIMEOUT = 3.0  # s for the network connection
 ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client, and its messages
+CLOSING = 1.0  # s for the last message
 KEEPALIVE = 15  # s without a message after which the broker is asked whether it is there
 MAX_DISCOVERED = 64  # parameters of a machine
 ONLINE, OFFLINE = "online", "offline"
@@ -70,8 +72,8 @@ class MqttPublisher:
         client, self._client = self._client, None
         self._discovered.clear()
         if client is not None:
-            if client.is_connected():
-                client.publish(self._availability, OFFLINE, qos=1, retain=True).wait_for_publish(1.0)
+            with contextlib.suppress(ValueError, RuntimeError):  # the connection was lost: the broker says it then
+                client.publish(self._availability, OFFLINE, qos=1, retain=True).wait_for_publish(CLOSING)
             client.disconnect()
             client.loop_stop()
 
