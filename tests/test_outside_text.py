@@ -39,8 +39,8 @@ from otolith.machine_file import MachineTable
 from otolith.publishing.html_report import html_report
 from otolith.publishing.recorder import LOG, _columns, operator_text, report_text
 from otolith.publishing.zenoh_session import prefix
+from otolith.runtime.hall.notifier import Notifier
 from otolith.runtime.process import EventCommand
-from otolith.runtime.service import Notifier
 from otolith.storage.evidence import public_text
 from otolith.storage.history import WINDOW, path_in
 from otolith_drivers.errors import ConfigurationError

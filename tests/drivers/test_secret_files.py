@@ -31,7 +31,7 @@ def with_opcua(folder: Path, **keys: object) -> None:
 
 
 def with_zenoh(folder: Path, **keys: object) -> None:
-    Access(ZenohTable.model_validate(keys), folder / "machine.toml").settings("otolith/here/motor", ["tcp/[::]:7447"])
+    Access(ZenohTable.model_validate(keys), folder / "machine.toml").settings(["otolith/here/motor"], ["tcp/[::]:7447"])
 
 
 def with_reader(folder: Path, **names: str) -> None:

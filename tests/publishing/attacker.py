@@ -13,7 +13,7 @@ import threading  # noqa: F401 - Zenoh imports it later, when the user may not r
 import zenoh
 
 FORGED = "forged"
-KEY = "otolith/here/motor/report"
+KEY = "otolith/s/m/report"
 GHOST = "otolith/here/ghost"
 BRIEFLY = 2.0  # s: a session that is accepted opens in some 10 ms, and its query is answered at once
 
@@ -48,7 +48,7 @@ def main() -> None:
         )
         ghost = session.liveliness().declare_token(f"{GHOST}/alive")
         queryable = session.declare_queryable(KEY, lambda query: query.reply(KEY, FORGED), complete=True)
-        for key in (KEY, f"{GHOST}/report", "otolith/here/motor/event"):
+        for key in (KEY, f"{GHOST}/report", "otolith/s/m/event"):
             session.put(key, FORGED)
             session.delete(key)
         sys.stdout.write("attacked\n")

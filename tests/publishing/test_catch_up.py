@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.subscriber import MessageOrder, Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, Topic, session, time_range
@@ -47,7 +47,7 @@ import sys
 from pathlib import Path
 from otolith.machine_file import ZenohTable
 from otolith.publishing.zenoh_config import Access
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.storage.history_writer import Bounds
 from otolith.storage.history_writer import HistoryWriter
 from tests.storage.histories import MACHINE, SITE, documents
@@ -55,7 +55,7 @@ writer = HistoryWriter(Path(sys.argv[1]), Bounds(50_000_000, 3650, 24))
 begin = float(sys.argv[3])
 numbers, _ = writer.open(begin)
 writer.start()
-publisher = Publisher(SITE, MACHINE, [], Access(ZenohTable(listen=(), connect=(sys.argv[2],))), writer)
+publisher = Publisher([Published(SITE, MACHINE, writer)], [], Access(ZenohTable(listen=(), connect=(sys.argv[2],))))
 reports = documents(1_000_000, start=begin)
 print("open", flush=True)
 for line in sys.stdin:
@@ -186,7 +186,7 @@ def test_a_slow_subscriber_misses_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     writer = HistoryWriter(tmp_path / f"{SITE}.{MACHINE}{SUFFIX}", BOUNDS)
     numbers, _ = writer.open(START)
     writer.start()
-    publisher = Publisher(SITE, MACHINE, [endpoint], archive=writer)
+    publisher = Publisher([Published(SITE, MACHINE, writer)], [endpoint])
     received, may_continue = list[str](), queue.Queue[None]()
 
     def receive(text: str) -> None:
@@ -214,7 +214,7 @@ def test_queries_select_by_time_and_number(tmp_path: Path) -> None:
     now = time.time()
     numbers, _ = writer.open(now)
     writer.start()
-    publisher = Publisher(SITE, MACHINE, [endpoint], archive=writer)
+    publisher = Publisher([Published(SITE, MACHINE, writer)], [endpoint])
     for report in documents(MAX_REPLIES + 200, start=now - 2.0 * (MAX_REPLIES + 200)):
         writer.add(numbers.number(report))
         if report.window.index % 100 == 0:

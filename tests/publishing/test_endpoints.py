@@ -15,7 +15,7 @@ import zenoh
 from otolith.machine_file import TlsTable, ZenohTable
 from otolith.publishing import publisher as module
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import SOCKET, Access, Credentials, listening
 from otolith.publishing.zenoh_session import protect_files
 from otolith_drivers.errors import ConfigurationError
@@ -58,7 +58,7 @@ def access(site: Path) -> Access:
 
 
 def opened(stack: ExitStack, *listen: str, access: Access = Access()) -> Publisher:  # noqa: B008 - immutable
-    return stack.enter_context(closing(Publisher("here", "motor", listen, access)))
+    return stack.enter_context(closing(Publisher([Published("s", "m")], listen, access)))
 
 
 def read(stack: ExitStack, daemon: Publisher, endpoint: str, credentials: Credentials | None = None) -> list[str]:
@@ -72,7 +72,7 @@ def test_endpoints_that_all_work_share_one_session(stack: ExitStack) -> None:
     daemon = opened(stack, "local", port)
     assert len(daemon._sessions) == 1
     assert daemon.outages(utc_now()) == {}
-    (local,) = listening(["local"], "here.motor")
+    (local,) = listening(["local"], "s.m")
     assert daemon.endpoints == f"{local}, {port}"
 
 
@@ -83,7 +83,7 @@ def test_an_endpoint_that_is_in_use_is_opened_once_it_is_free(
     endpoint = f"tcp/127.0.0.1:{number}"
     with socket.create_server(("127.0.0.1", number)):
         daemon = opened(stack, endpoint, "local")
-        (local,) = listening(["local"], "here.motor")
+        (local,) = listening(["local"], "s.m")
         assert read(stack, daemon, local) == EXPECTED
         ((name, reason),) = daemon.outages(utc_now()).items()
         assert endpoint in name
@@ -100,7 +100,7 @@ def test_a_certificate_that_is_not_valid_now_costs_only_the_encrypted_endpoint(
     use(site, name)
     endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     daemon = opened(stack, "local", endpoint, access=access(site))
-    (local,) = listening(["local"], "here.motor")
+    (local,) = listening(["local"], "s.m")
     assert read(stack, daemon, local) == EXPECTED
     ((key, text),) = daemon.outages(utc_now()).items()
     assert endpoint in key
@@ -125,7 +125,7 @@ def test_a_mistake_in_the_files_is_refused_also_if_they_have_expired(site: Path,
     else:
         host = "127.0.0.2"
     with pytest.raises(ConfigurationError, match=r"machine\.toml"):
-        Publisher("here", "motor", ["local", f"tls/{host}:7447"], access(site))
+        Publisher([Published("s", "m")], ["local", f"tls/{host}:7447"], access(site))
 
 
 def test_a_folder_for_sockets_that_cannot_be_used_costs_only_the_socket(
@@ -143,7 +143,7 @@ def test_a_folder_for_sockets_that_cannot_be_used_costs_only_the_socket(
     assert "state" in reason
     (tmp_path / "state").unlink()
     wait_for(lambda: not daemon.outages(utc_now()))
-    (local,) = listening(["local"], "here.motor")
+    (local,) = listening(["local"], "s.m")
     assert read(stack, daemon, local) == EXPECTED
 
 
@@ -173,7 +173,7 @@ def test_what_other_threads_write_meanwhile_has_the_permissions_of_the_process(
 
     monkeypatch.setattr(zenoh, "open", open_beside_a_writer)
     protect_files()
-    (endpoint,) = listening(["local"], "here.motor")
+    (endpoint,) = listening(["local"], "s.m")
     opened(stack, endpoint)
     assert modes == [0o644]
     assert Path(endpoint.removeprefix(SOCKET)).stat().st_mode & 0o777 == 0o660

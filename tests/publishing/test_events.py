@@ -14,7 +14,7 @@ from otolith.health.schema import EventChange, EventDocument, ParameterDocument,
 from otolith.health.text import value_cells
 from otolith.health.times import moment_text
 from otolith.machine import load_machine
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.recorder import _log_lines
 from otolith.publishing.zenoh_session import EVENT, session
 from otolith.runtime.service import SUMMARY_INTERVAL, Service
@@ -33,7 +33,7 @@ def documents() -> list[ReportDocument]:
 
 def test_each_change_of_an_event_is_published_once() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    publisher = Publisher("here", "motor", [endpoint])
+    publisher = Publisher([Published("s", "m")], [endpoint])
     received: list[tuple[str, str]] = []
 
     def published(document: ReportDocument, count: int) -> bool:
@@ -41,7 +41,7 @@ def test_each_change_of_an_event_is_published_once() -> None:
         return len(received) > count
 
     def events() -> list[EventDocument]:
-        key = EVENT.under("here", "motor")
+        key = EVENT.under("s", "m")
         return [EventDocument.model_validate_json(text) for own, text in received if own == key]
 
     with session(connect=[endpoint]) as listener:

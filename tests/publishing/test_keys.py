@@ -17,7 +17,7 @@ from otolith.cli.main import cli
 from otolith.health.labels import expiry_event
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import (
     NOTICE_DAYS,
@@ -63,7 +63,7 @@ def settings(site: Path, endpoint: str = ENDPOINT, access: AccessTable | None = 
     """The warning of the settings of a daemon."""
     tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
     table = ZenohTable(tls=tls, access=access or AccessTable())
-    return Access(table, site / "machine.toml").settings("otolith/here/motor", [endpoint])[1].warning(utc_now())
+    return Access(table, site / "machine.toml").settings(["otolith/s/m"], [endpoint])[1].warning(utc_now())
 
 
 def test_a_certificate_that_the_disk_has_no_room_for_leaves_no_key(tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_a_daemon_that_runs_for_years_warns_of_its_certificate(site: Path, caplo
     endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     make_certificate(site, "own", ["127.0.0.1"], utc_now())
     tls = TlsTable(ca=Path("ca.crt"), certificate=Path("own.crt"), key=Path("own.key"))
-    publisher = Publisher("here", "motor", [endpoint], Access(ZenohTable(tls=tls), site / "machine.toml"))
+    publisher = Publisher([Published("s", "m")], [endpoint], Access(ZenohTable(tls=tls), site / "machine.toml"))
     try:
         for days in (0, CERTIFICATE_DAYS - 40):
             publisher.warn_of_expiry(utc_now() + timedelta(days=days))
@@ -216,7 +216,7 @@ def test_a_daemon_that_starts_again_does_not_repeat_a_notice(site: Path, days: f
 
     def notice(after: float) -> Validity | None:
         endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-        with closing(Publisher("hall-1", "press-3", [endpoint], own, archive)) as publisher:
+        with closing(Publisher([Published("hall-1", "press-3", archive)], [endpoint], own)) as publisher:
             return publisher.expiry_notice(now + timedelta(days=after))
 
     told = notice(0.0)
@@ -232,13 +232,13 @@ def test_a_daemon_that_starts_again_does_not_repeat_a_notice(site: Path, days: f
 
 def test_an_encrypted_endpoint_needs_certificates(site: Path) -> None:
     with raises_saying(ConfigurationError, "tls/press.local:7447", "[zenoh.tls]", "missing"):
-        Access(ZenohTable(), site / "machine.toml").settings("otolith/here/motor", [ENDPOINT])
+        Access(ZenohTable(), site / "machine.toml").settings(["otolith/s/m"], [ENDPOINT])
 
 
 def test_names_of_readers_need_a_proof(site: Path) -> None:
     table = ZenohTable(access=AccessTable(readers=("operator",)))
     with raises_saying(ConfigurationError, "zenoh.access.readers", "proves"):
-        Access(table, site / "machine.toml").settings("otolith/here/motor", [ENDPOINT.replace("tls", "tcp")])
+        Access(table, site / "machine.toml").settings(["otolith/s/m"], [ENDPOINT.replace("tls", "tcp")])
 
 
 @pytest.mark.parametrize("text", ["operator", "operator:", ":secret", " operator:secret", "a:b\n\nc:d"])
@@ -284,8 +284,8 @@ def test_a_reader_finds_sockets_as_they_appear() -> None:
     texts: list[str] = []
     with Subscriber(Connection(), texts.append) as subscriber:
         assert "no daemon of this user" in subscriber.state()
-        (endpoint,) = listening(["local"], "here.motor")
-        publisher = Publisher("here", "motor", [endpoint])
+        (endpoint,) = listening(["local"], "s.m")
+        publisher = Publisher([Published("s", "m")], [endpoint])
         try:
             assert local_sockets() == [endpoint]
 
@@ -295,9 +295,9 @@ def test_a_reader_finds_sockets_as_they_appear() -> None:
 
             wait_for(arrives)
             assert "connected" in subscriber.state()
-            with pytest.raises(ServiceError, match=r"here\.motor\.sock is in use"):
+            with pytest.raises(ServiceError, match=r"s\.m\.sock is in use"):
                 _refuse_busy([endpoint])  # of the demo
-            with closing(Publisher("here", "motor", [endpoint])) as other:
+            with closing(Publisher([Published("s", "m")], [endpoint])) as other:
                 assert "another daemon publishes there" in str(other.outages(utc_now()))
         finally:
             publisher.close()
@@ -320,15 +320,15 @@ def test_a_runtime_directory_that_others_may_write_is_refused(runtime: Path) -> 
     (runtime / "otolith").mkdir()
     (runtime / "otolith").chmod(0o777)
     with raises_saying(ServiceError, "writable", "readers"):
-        listening(["local"], "here.motor")
+        listening(["local"], "s.m")
 
 
 def test_sockets_without_a_runtime_directory_are_found(monkeypatch: pytest.MonkeyPatch, runtime: Path) -> None:
     """As in a container, or after su, where the variable names another user's directory."""
     monkeypatch.setenv("XDG_STATE_HOME", str(runtime / "state"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime / "missing"))
-    (endpoint,) = listening(["local"], "here.motor")
-    assert endpoint == f"unixsock-stream/{runtime}/state/otolith/here.motor.sock"
-    publisher = Publisher("here", "motor", [endpoint])
+    (endpoint,) = listening(["local"], "s.m")
+    assert endpoint == f"unixsock-stream/{runtime}/state/otolith/s.m.sock"
+    publisher = Publisher([Published("s", "m")], [endpoint])
     publisher.close()
     assert not list((runtime / "state" / "otolith").iterdir())

@@ -24,7 +24,7 @@ from otolith.publishing.certificates import (
     renew_certificate,
     utc_now,
 )
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access, Credentials
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.cli.commands import otolith
@@ -76,7 +76,7 @@ def credentials(site: Path, name: str) -> Credentials:
 def test_old_and_new_certificate_of_a_name_read_until_the_name_is_revoked(site: Path, stack: ExitStack) -> None:
     """docs/security.md: 'Renew a certificate' and 'Exclude a reader'."""
     endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
-    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    daemon = stack.enter_context(closing(Publisher([Published("s", "m")], [endpoint], access(site, "operator"))))
     renewal = renew_certificate(site, "operator", [], utc_now())
     old = Reader(endpoint, credentials(site, renewal.kept.stem))
     stack.callback(old.session.close)
@@ -101,7 +101,7 @@ def test_a_daemon_takes_over_a_renewed_certificate_without_a_restart(
     site: Path, stack: ExitStack, caplog: pytest.LogCaptureFixture
 ) -> None:
     endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
-    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    daemon = stack.enter_context(closing(Publisher([Published("s", "m")], [endpoint], access(site, "operator"))))
     connected = Reader(endpoint, credentials(site, "operator"))
     stack.callback(connected.session.close)
     assert connected.receives(daemon) == EXPECTED
@@ -119,7 +119,7 @@ def test_a_daemon_takes_over_a_renewed_certificate_without_a_restart(
 def test_half_of_a_renewal_changes_nothing(site: Path, stack: ExitStack, caplog: pytest.LogCaptureFixture) -> None:
     """Certificate and key are copied one after the other."""
     endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
-    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    daemon = stack.enter_context(closing(Publisher([Published("s", "m")], [endpoint], access(site, "operator"))))
     before = daemon._sessions
     reader = Reader(endpoint, credentials(site, "operator"))
     stack.callback(reader.session.close)
@@ -278,7 +278,7 @@ def test_a_certificate_that_expires_soon_is_an_event_in_the_history_and_no_state
     site: Path, stack: ExitStack, daemons: Start
 ) -> None:
     endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
-    publishing = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site, "operator"))))
+    publishing = stack.enter_context(closing(Publisher([Published("s", "m")], [endpoint], access(site, "operator"))))
     running = daemons(Computer())
     for name in ("warning", "expiry_notice", "warn_of_expiry"):
         setattr(running, name, getattr(publishing, name))
@@ -300,7 +300,7 @@ def test_what_cannot_be_opened_anew_is_named_and_tried_again_and_the_rest_goes_o
 ) -> None:
     """The files may change again between the look at them and the new session."""
     good, bad = (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
-    daemon = stack.enter_context(closing(Publisher("here", "motor", [good, bad], access(site))))
+    daemon = stack.enter_context(closing(Publisher([Published("s", "m")], [good, bad], access(site))))
     opening, failing = daemon._open, [True]
 
     def opened(endpoints: publisher._Endpoints) -> None:
@@ -321,7 +321,7 @@ def test_files_that_cannot_be_checked_leave_the_session_and_the_thread(
     site: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    daemon = stack.enter_context(closing(Publisher("here", "motor", [endpoint], access(site))))
+    daemon = stack.enter_context(closing(Publisher([Published("s", "m")], [endpoint], access(site))))
 
     def broken(*_: object) -> None:
         raise ValueError("a form of certificate that is not known")

@@ -18,7 +18,7 @@ import zenoh
 
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import make_authority, make_certificate, utc_now
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import (
     MAX_HALF_OPEN,
     TLS,
@@ -123,7 +123,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 def publisher(stack: ExitStack, endpoint: str, access: Access = Access()) -> Publisher:  # noqa: B008 - immutable
-    opened = Publisher("here", "motor", [endpoint], access)
+    opened = Publisher([Published("s", "m")], [endpoint], access)
     stack.callback(opened.close)
     return opened
 
@@ -156,12 +156,12 @@ def test_nobody_but_the_daemon_publishes_under_its_keys(stack: ExitStack) -> Non
     texts += victim.receives(daemon)
     assert texts == 2 * EXPECTED
     assert latest == EXPECTED[-1:]
-    assert victim.alive == [ALIVE.under("here", "motor")]
+    assert victim.alive == [ALIVE.under("s", "m")]
 
 
 @as_root
 def test_another_user_cannot_open_the_socket(stack: ExitStack) -> None:
-    (endpoint,) = listening(["local"], "here.motor")
+    (endpoint,) = listening(["local"], "s.m")
     path = Path(endpoint.removeprefix("unixsock-stream/"))
     daemon = publisher(stack, endpoint)
     assert path.stat().st_mode & 0o777 == 0o660
@@ -215,7 +215,7 @@ def test_only_readers_with_a_certificate_read_over_the_network(stack: ExitStack,
         own.receives(daemon)
         assert received() == []
     assert own.receives(daemon) == EXPECTED
-    assert own.alive == [ALIVE.under("here", "motor")]
+    assert own.alive == [ALIVE.under("s", "m")]
 
 
 def test_a_reader_refuses_a_daemon_of_another_site(stack: ExitStack, site: Path) -> None:
@@ -251,13 +251,13 @@ def test_reports_pass_a_router(stack: ExitStack) -> None:
     """It sends the daemon the subscriptions and queries of its own clients."""
     endpoint = tcp()
     stack.callback(session([endpoint], settings={"mode": "router"}).close)
-    daemon = Publisher("here", "motor", [], Access(ZenohTable(listen=(), connect=(endpoint,))))
+    daemon = Publisher([Published("s", "m")], [], Access(ZenohTable(listen=(), connect=(endpoint,))))
     stack.callback(daemon.close)
     client = Reader(endpoint, mode="client")
     stack.callback(client.session.close)
     assert client.receives(daemon) == EXPECTED
     assert client.queried() == EXPECTED[-1:]
-    assert client.alive == [ALIVE.under("here", "motor")]
+    assert client.alive == [ALIVE.under("s", "m")]
 
 
 @pytest.mark.parametrize("protocol", ["tcp", "tls"])
@@ -316,8 +316,8 @@ def test_only_configured_endpoints_listen(stack: ExitStack) -> None:
         )
 
     before, endpoint = listened(), tcp()
-    (local,) = listening(["local"], "here.motor")
-    opened = Publisher("here", "motor", [local, endpoint])
+    (local,) = listening(["local"], "s.m")
+    opened = Publisher([Published("s", "m")], [local, endpoint])
     stack.callback(opened.close)
     reader(stack, local)
     assert {address for address in listened() - before if address} == {endpoint, local.removeprefix("unixsock-stream/")}

@@ -9,10 +9,11 @@ from rich.console import Console
 
 from otolith.cli.operation.live_table import LiveTable
 from otolith.machine import load_machine
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith.publishing.zenoh_session import StartDocument
+from otolith.runtime.hall.daemon import Daemon
 from otolith.runtime.hall.pool import Preparation
 from otolith.runtime.service import Service
 from tests.conftest import EXAMPLES, free_port
@@ -34,7 +35,7 @@ def reader(endpoint: str) -> Iterator[Subscriber]:
 
 def test_a_reader_knows_how_far_a_daemon_is_that_starts() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    publisher = Publisher(SITE, MACHINE, [endpoint])
+    publisher = Publisher([Published(SITE, MACHINE)], [endpoint])
     try:
         publisher.publish_start(start(2))
         with reader(endpoint) as first:
@@ -76,18 +77,19 @@ class Recorded:
 
 def test_the_service_tells_each_step_once() -> None:
     service, recorded = Service(load_machine(EXAMPLES / "dc-motor-in-process.toml")), Recorded()
-    service._publisher = service._notifier = recorded  # type: ignore[assignment]  # has the methods that are used
+    hall = Daemon([service])
+    service._publisher = hall._notifier = recorded  # type: ignore[assignment]  # has the methods that are used
     for prepared, is_ready in (([], False), ([], False), ([True], False), ([True, True], False), ([True] * 11, True)):
-        (worker,) = service._pool.workers
+        (worker,) = hall._pool.workers
         worker.prepared, worker.is_ready = list(prepared), is_ready
-        service._show_preparation()
-        service._show_preparation()
+        hall._show_preparation()
+        hall._show_preparation()
     assert [document.done for document in recorded.starts] == [0, 1, 2, 11]
     assert ["1 of 11" in status for status in recorded.statuses] == [False, True, False, False]
 
 
 def test_no_session_is_closed_while_a_start_is_put_on_it() -> None:
-    publisher, held = Publisher(SITE, MACHINE, []), list[bool]()
+    publisher, held = Publisher([Published(SITE, MACHINE)], []), list[bool]()
 
     class Session:
         def put(self, *_: object, **__: object) -> None:

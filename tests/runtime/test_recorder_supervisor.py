@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.recorder_supervisor import FOLDER_TIMEOUT, MIN_DEATHS, RECORDER_TIMEOUT, RecorderSupervisor
 from otolith.storage.recording_files import RecordingFile, RecordingFolder
 from otolith_drivers.errors import ServiceError
@@ -63,7 +64,7 @@ def test_a_stopped_recorder_is_killed_and_counted(
     supervisor.start(0.0)
     supervisor.offer(first, 1.0)
     wait_for(answered(supervisor, 2.0))
-    stopped = supervisor._process._process.pid
+    stopped = supervisor._whole.child._process.pid
     os.kill(stopped, signal.SIGSTOP)
     for index, one in enumerate(rest):
         supervisor.offer(one, 100.0 + 2.0 * index)
@@ -87,8 +88,8 @@ def test_a_recorder_that_always_dies_has_an_outage(supervisor: RecorderSuperviso
     supervisor.offer(next(noise(1)), 1.0)
     outages, now = list[str](), 2.0
     for _ in range(MIN_DEATHS):
-        supervisor._process._process.kill()
-        supervisor._process._process.join()
+        supervisor._whole.child._process.kill()
+        supervisor._whole.child._process.join()
         wait_for(lambda: not supervisor._process.alive)
         while not supervisor._process.alive:
             outages.append(supervisor.outage)
@@ -233,5 +234,41 @@ def test_the_environment_may_switch_recordings_off(
     assert supervisor.is_enabled
     monkeypatch.setenv("RERUN", value)
     assert not supervisor.is_enabled
-    supervisor.reload(machine, 0.0, 0.0)
+    supervisor.reload(machine, 0.0)
     assert not supervisor._process.alive
+
+
+def test_machines_share_a_process_and_a_disk_that_fails_concerns_one_of_them(
+    machine: LoadedMachine, tmp_path: Path
+) -> None:
+    whole, supervisors = RecorderProcess(2), list[RecorderSupervisor]()
+    for number in range(2):
+        identity = machine.file.machine.model_copy(update={"name": f"motor-{number}"})
+        folder = machine.file.recording.model_copy(update={"folder": tmp_path / f"recordings-{number}"})
+        file = machine.file.model_copy(update={"machine": identity, "recording": folder})
+        supervisors.append(RecorderSupervisor(replace(machine, file=file), None, whole))
+    (first, second), (one, other) = supervisors, noise(2)
+    for supervisor in supervisors:
+        supervisor.start(0.0)
+        supervisor.offer(one, 1.0)
+    for supervisor in supervisors:
+        wait_for(answered(supervisor, 2.0))
+    assert whole.child.starts == 1
+    (path,) = (tmp_path / "recordings-0").iterdir()
+    path.unlink()  # the size of the file is looked at for each window
+    first.offer(other, 3.0)
+    second.offer(other, 3.0)
+    wait_for(answered(second, 4.0))
+
+    def has_ended() -> bool:
+        second.poll(5.0)
+        return not first._process.alive
+
+    wait_for(has_ended)
+    assert second._process.alive
+    poll(first, 6.0)
+    assert (first.restarts, first.dropped, second.restarts, second.dropped) == (1, 2, 0, 0)
+    whole.stop(10.0)
+    (kept,) = (tmp_path / "recordings-1").iterdir()
+    with RecordingReader(kept, UNITS) as reader:
+        assert sum(len(part.times) for part in reader.chunks()) == 400

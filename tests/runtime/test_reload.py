@@ -100,7 +100,7 @@ def test_a_file_that_vanishes_during_a_reload_does_not_end_the_daemon(
         raise ConfigurationError("dc-motor-in-process.toml: no such file")
 
     monkeypatch.setattr("otolith.runtime.service.files_of", vanished)
-    service._reload()
+    service.reload()
     assert "not reloaded, the daemon goes on as before: dc-motor-in-process.toml: no such file" in caplog.text
 
 
@@ -113,7 +113,7 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     store = store_of(service._loaded)
     store.operator.write(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
     path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
-    service._reload()
+    service.reload()
     limited = service.machine.next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)

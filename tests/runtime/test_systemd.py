@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.runtime.service import Notifier
+from otolith.runtime.hall.notifier import Notifier
 
 
 @pytest.fixture

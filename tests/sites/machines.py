@@ -8,7 +8,7 @@ from pathlib import Path
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, HealthDocument, ParameterDocument, ReportDocument, Status
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_session import close_session, session
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_writer import Bounds, HistoryWriter
@@ -60,7 +60,7 @@ class Daemon:
         self._writer = HistoryWriter(folder / f"{SITE}.{machine}{SUFFIX}", BOUNDS)
         self._numbers, _ = self._writer.open(time.time())
         self._writer.start()
-        self._publisher = Publisher(SITE, machine, [endpoint], archive=self._writer)
+        self._publisher = Publisher([Published(SITE, machine, self._writer)], [endpoint])
 
     def keep(self, report: ReportDocument) -> ReportDocument:
         """Number a report and keep it."""

@@ -21,8 +21,10 @@ from otolith.estimation.problem import Component
 from otolith.health.schema import Status
 from otolith.machine import RecordedMachine, find_twin, load_machine
 from otolith.publishing import recorder
+from otolith.runtime.hall.daemon import Daemon
 from otolith.runtime.hall.pool import COMPILE_TIMEOUT, STALL_TIMEOUT
 from otolith.runtime.service import Service
+from otolith.storage.recording_files import Ended, Opened
 from otolith.storage.state_store import StateStore
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ServiceError
@@ -116,7 +118,8 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         monkeypatch.setenv("WATCHDOG_USEC", "4000000")
         text = own_machine.machine.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
         own_machine.machine.write_text(text, encoding="utf-8")
-        service = Service(load_machine(own_machine.machine))
+        hall = Daemon([Service(load_machine(own_machine.machine))])
+        (machine,) = hall._services
 
         def fed() -> bool:
             try:
@@ -124,30 +127,30 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
             except BlockingIOError:
                 return False
 
-        (worker,) = service._pool.workers
+        (worker,) = hall._pool.workers
         worker.stall.begin(1000.0, 0.0)
-        service._feed_watchdog(1002.0)
+        hall._feed_watchdog(1002.0)
         assert fed()
         patience = STALL_TIMEOUT + 3 * 2.0 + COMPILE_TIMEOUT
-        service._feed_watchdog(1000.0 + patience - 0.1)
+        hall._feed_watchdog(1000.0 + patience - 0.1)
         assert fed()
-        service._feed_watchdog(1000.0 + patience + 0.1)
+        hall._feed_watchdog(1000.0 + patience + 0.1)
         assert not fed()
-        service.machine.missed += 1
-        service._feed_watchdog(1000.0 + patience + 3.0)
+        machine.missed += 1
+        hall._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        service._pool._compiled += 1  # a kernel is compiled: time for the next one
-        service._feed_watchdog(1000.0 + patience + 6.0)
+        hall._pool._compiled += 1  # a kernel is compiled: time for the next one
+        hall._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
-        service._feed_watchdog(1000.0 + 2 * patience + 5.9)
+        hall._feed_watchdog(1000.0 + 2 * patience + 5.9)
         assert fed()
-        service.machine.finished += 1  # a window is finished
+        machine.finished += 1  # a window is finished
         worker.is_compiling = False
-        service._feed_watchdog(1000.0 + 2 * patience + 8.0)
+        hall._feed_watchdog(1000.0 + 2 * patience + 8.0)
         assert fed()
-        service._feed_watchdog(1000.0 + 2 * patience + 8.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)
+        hall._feed_watchdog(1000.0 + 2 * patience + 8.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)
         assert not fed()
-        service._notifier.close()
+        hall._notifier.close()
 
 
 def replaced_by_file(folder: Path) -> bool:
@@ -216,17 +219,26 @@ def test_a_daemon_whose_lock_another_has_taken_ends(running: Running) -> None:
 
 
 class Pipe:
-    """A connection on which nothing must be received."""
+    """A connection to the recorder process: what it receives, and what it sends."""
+
+    def __init__(self, *received: object) -> None:
+        self._received, self.sent = list(received), list[object]()
 
     def recv(self) -> object:
-        raise AssertionError
+        return self._received.pop(0) if self._received else None
+
+    def send(self, message: object) -> None:
+        self.sent.append(message)
 
 
-def test_the_recorder_ends_before_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_ends_before_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
     twin = find_twin("dc_motor")
-    recorder.main(Pipe(), tmp_path / "full.rrd", RecordedMachine("full", twin, twin.parameters[:1], Sampling.TRUE, {}))
+    machine = RecordedMachine("full", twin, twin.parameters[:1], Sampling.TRUE, {})
+    pipe = Pipe(("here.full", 1, Opened(tmp_path / "full.rrd", machine, None)))
+    recorder.main(pipe)
+    assert pipe.sent == [("here.full", 1, Ended(""))]
     assert not (tmp_path / "full.rrd").exists()
 
 

@@ -36,7 +36,14 @@ def _machine_file(_: click.Context, __: click.Parameter, given: str) -> Path:
     return file_of(given)
 
 
+def _machine_paths(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> tuple[Path, ...]:
+    from otolith.cli.machines import file_of
+
+    return tuple(Path(text) if Path(text).is_dir() else file_of(text) for text in given)
+
+
 MACHINE_FILE = click.argument("file", metavar="FILE|MACHINE", callback=_machine_file)
+MACHINES = click.argument("paths", metavar="PATH...", nargs=-1, required=True, callback=_machine_paths)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 

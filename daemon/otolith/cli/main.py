@@ -29,6 +29,7 @@ from otolith.cli.common import (
     FILE,
     INTERRUPTED,
     MACHINE_FILE,
+    MACHINES,
     StopSignal,
     endpoints,
     log_to_stderr,
@@ -120,38 +121,37 @@ def cli() -> None:
 
 
 @cli.command()
-@MACHINE_FILE
+@MACHINES
 @click.option("--listen", multiple=True, callback=endpoints, metavar="ENDPOINT",
               help="Publish here instead of where the file says; may be repeated.")  # fmt: skip
 @click.option("--recording", type=FILE, callback=_new_recording,
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
+@click.option("--workers", type=click.IntRange(1), metavar="NUMBER",
+              help="Processes that compute for several machines; as many as processors without it.")  # fmt: skip
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
-def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
-    """Run the daemon for the machine in FILE.
+def run(
+    paths: tuple[Path, ...], listen: tuple[str, ...], recording: Path | None, workers: int | None, verbose: bool
+) -> int:
+    """Run the daemon for the machines in PATH.
 
+    PATH is a machine file, the name of a machine, or a directory of machine files. The machines of several files share
+    the processes of one daemon: a hall.
     It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits, rules,
-    [recording], certificates and readers from FILE.
+    [recording], certificates and readers from the files.
 
     \b
     Examples:
       otolith run config/dc-motor.toml
       otolith run config/dc-motor.toml --listen tcp/127.0.0.1:7450
+      otolith run /etc/otolith/hall
     """
     import faulthandler
 
-    from otolith.machine import load_machine
-    from otolith.runtime.service import Service
-    from otolith_drivers.errors import ConfigurationError
+    from otolith.cli.run import serve
 
     log_to_stderr(verbose=verbose)
     faulthandler.enable()  # systemd's watchdog sends SIGABRT: the log then has where each thread was
-    try:
-        machine = load_machine(file)
-        machine.try_fmu()
-    except ConfigurationError as error:
-        error.exit_code = os.EX_CONFIG  # so that systemd distinguishes it from a bus that may come up later
-        raise
-    ended_by = Service(machine, listen or None, recording).run()
+    ended_by = serve(paths, listen or None, recording, workers)
     return INTERRUPTED if ended_by == signal.SIGINT else 0
 
 

@@ -1,15 +1,17 @@
-"""Publishes the reports of one machine on all its endpoints; one that cannot be opened does not concern the others.
+"""Publishes the reports of machines on all their endpoints; one that cannot be opened does not concern the others.
 
-All endpoints share one Zenoh session. If one of them cannot be opened, each gets a session of its own, and a thread
-tries the rest again. It also looks whether certificates or passwords were replaced: then it opens the sessions anew.
+All endpoints and machines share one Zenoh session. If one of the endpoints cannot be opened, each gets a session of its
+own, and a thread tries the rest again. It also looks whether certificates or passwords were replaced: then it opens the
+sessions anew.
 """
 
 import logging
 import math
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
+from functools import partial
 
 import zenoh
 
@@ -24,6 +26,7 @@ from otolith.publishing.zenoh_session import (
     REPORT,
     START,
     StartDocument,
+    Topic,
     answer,
     close_session,
     prefix,
@@ -41,6 +44,22 @@ RENEWAL_INTERVAL = 60.0  # s between two looks at the files of certificates and 
 CLOSE_WAIT = 1.0  # s for a try that has begun
 RENEWAL = "its session is opened anew"  # Why endpoints wait whose files were replaced
 UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; everything else is a mistake
+
+
+@dataclass(eq=False, slots=True)
+class Published:
+    """A machine that is published; queries for its earlier reports and events are answered from ``archive``."""
+
+    site: str
+    machine: str
+    archive: HistoryWriter | None = None
+    latest: str | None = None  # Its report, under the lock of the publisher as what follows
+    start: str | None = None
+
+    @property
+    def prefix(self) -> str:
+        """The beginning of its keys."""
+        return prefix(self.site, self.machine)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,35 +87,32 @@ class _Session:
 
     endpoints: _Endpoints
     opened: zenoh.Session
-    reports: zenoh.Publisher
+    reports: Mapping[tuple[str, str], zenoh.Publisher]  # By site and machine
     declared: tuple[object, ...]
     access: Access
     stamps: tuple[object, ...]  # Of the files of ``access`` when it was opened
 
 
 class Publisher:
-    """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
+    """Publishes the reports of machines and answers queries for the latest ones, and for earlier ones."""
 
     def __init__(
         self,
-        site: str,
-        machine: str,
+        machines: Sequence[Published],
         listen: Iterable[str],
         access: Access = Access(),  # noqa: B008 - immutable
-        archive: HistoryWriter | None = None,
     ) -> None:
-        """Queries for earlier reports and events are answered from ``archive``.
+        """Where they listen on a socket of this computer, it has the name of the first machine.
 
         Raises:
             ConfigurationError: the machine file, or a file that it names, is wrong.
         """
-        self._site, self._machine, self._access, self._archive = site, machine, access, archive
+        self._machines = {(each.site, each.machine): each for each in machines}
+        self._first, self._access = machines[0], access
         self._lock, self._closing, self._wake = threading.Lock(), threading.Event(), threading.Event()
-        self._latest: str | None = None
-        self._start: str | None = None
         self._validity, self._warned_on = Validity(), date.min
         # When it was last told that a certificate expires, by its end; Unix s
-        self._noticed = {} if access.zenoh.tls is None else _notices(archive)
+        self._noticed = {} if access.zenoh.tls is None else _notices(self._first.archive)
         self._refused = ""  # Why files that were replaced cannot be used
         self._unusable: tuple[object, ...] = ()  # Stamps of the files at the latest look that could not use them
         self._sessions: tuple[_Session, ...] = ()
@@ -120,14 +136,15 @@ class Publisher:
         """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
         text = document.to_json()
         others: list[tuple[str, DocumentModel]] = [
-            (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
+            (PARAMETER.under(document.site, document.machine, name), item) for name, item in document.parameters.items()
         ]
-        others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
+        others += [(EVENT.under(document.site, document.machine), event) for event in announcements(document)]
         texts = [(key, item.json_line()) for key, item in others]
+        name = document.site, document.machine
         with self._lock:  # so that no session is closed meanwhile
-            self._latest = text
+            self._machines[name].latest = text
             for each in self._sessions:
-                each.reports.put(text)
+                each.reports[name].put(text)
             for key, own in texts:
                 self._put(key, own)
 
@@ -140,8 +157,9 @@ class Publisher:
         """Tell how far the daemon is that starts; a document that is done is the last one."""
         text = document.json_line()
         with self._lock:
-            self._start = text if document.done < document.total else None
-            self._put(START.under(self._site, self._machine), text)
+            own = self._machines[document.site, document.machine]
+            own.start = text if document.done < document.total else None
+            self._put(START.under(own.site, own.machine), text)
 
     def outages(self, now: datetime) -> dict[str, str]:
         """Return the endpoints where nobody can connect, and why."""
@@ -271,22 +289,20 @@ class Publisher:
 
     def _open(self, endpoints: _Endpoints) -> None:
         """Open a session; raise what is in ``UNAVAILABLE``, or ConfigurationError."""
-        site, machine = self._site, self._machine
-        listen = listening(endpoints.listen, f"{site}.{machine}")
+        listen = listening(endpoints.listen, f"{self._first.site}.{self._first.machine}")
         access = self._access
         stamps = access.stamps()  # before the files are read: a later change shows
         settings, validity = self._settings(access, _Endpoints(listen, endpoints.connect))
         opened = session(listen, endpoints.connect, settings)
-        key = REPORT.under(site, machine)
-        reports = opened.declare_publisher(
-            key, encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=zenoh.CongestionControl.DROP
-        )
-        declared = (
-            opened.declare_queryable(key, self._answer, complete=True),
-            opened.declare_queryable(EVENT.under(site, machine), self._answer_events, complete=True),
-            opened.declare_queryable(START.under(site, machine), self._answer_start, complete=True),
-            opened.liveliness().declare_token(ALIVE.under(site, machine)),
-        )
+        reports = {
+            name: opened.declare_publisher(
+                REPORT.under(*name),
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+            for name in self._machines
+        }
+        declared = tuple(item for each in self._machines.values() for item in self._declared(opened, each))
         with self._lock:
             is_late = self._closing.is_set()
             if not is_late:
@@ -300,23 +316,25 @@ class Publisher:
 
     def _settings(self, access: Access, endpoints: _Endpoints) -> tuple[Settings, Validity]:
         own = access.zenoh.model_copy(update={"connect": endpoints.connect})
-        return replace(access, zenoh=own).settings(prefix(self._site, self._machine), endpoints.listen)
+        prefixes = tuple(each.prefix for each in self._machines.values())
+        return replace(access, zenoh=own).settings(prefixes, endpoints.listen)
 
-    def _answer(self, query: zenoh.Query) -> None:
-        with self._lock:
-            latest = self._latest
-        with query:
-            answer(query, REPORT.under(self._site, self._machine), "report", latest, self._archive)
+    def _declared(self, opened: zenoh.Session, own: Published) -> tuple[object, ...]:
+        """Declare in a session that a machine is alive, and what answers queries about it."""
+        keys = {topic: topic.under(own.site, own.machine) for topic in (REPORT, EVENT, START)}
 
-    def _answer_events(self, query: zenoh.Query) -> None:
-        with query:
-            answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)
+        def reply(query: zenoh.Query, topic: Topic, kind: str) -> None:
+            with self._lock:
+                latest = {REPORT: own.latest, START: own.start}.get(topic)
+            with query:
+                answer(query, keys[topic], kind, latest, None if topic is START else own.archive)
 
-    def _answer_start(self, query: zenoh.Query) -> None:
-        with self._lock:
-            start = self._start
-        with query:
-            answer(query, START.under(self._site, self._machine), "start", start, None)
+        return (
+            opened.declare_queryable(keys[REPORT], partial(reply, topic=REPORT, kind="report"), complete=True),
+            opened.declare_queryable(keys[EVENT], partial(reply, topic=EVENT, kind="event"), complete=True),
+            opened.declare_queryable(keys[START], partial(reply, topic=START, kind="start"), complete=True),
+            opened.liveliness().declare_token(ALIVE.under(own.site, own.machine)),
+        )
 
 
 def _notices(archive: HistoryWriter | None) -> dict[float, float]:

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,15 @@ from otolith.health.text import (
 )
 from otolith.health.times import clock_in, in_local_time, moment_text
 from otolith.machine import RecordedMachine
-from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
+from otolith.storage.recording_files import (
+    EVENT_MARGIN,
+    FILE_MODE,
+    MIN_FREE_SHARE,
+    Ended,
+    Opened,
+    RecordingFolder,
+    shortage_of,
+)
 from otolith.twin.definition import Input, Output
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.grammars.markdown import markdown_text
@@ -74,22 +83,51 @@ STATES = {
 }
 
 
-def main(connection: Any, path: Path, source: RecordedMachine, folder: RecordingFolder | None = None) -> None:
-    """Record reports until None comes, the connection closes or the disk is full.
+def main(connection: Any) -> None:
+    """Record reports of several machines until None comes or the connection closes.
 
-    Without ``folder`` all goes into the file ``path``. Each report is answered with the number of windows that are not
-    yet written.
+    Each message has the name and number of a recording, and what is to be done: :class:`Opened`, a report, or None at
+    its end. Each report is answered with the number of windows that are not yet written, a recording that ends with
+    :class:`Ended`: a disk that fails concerns no other recording.
     """
-    if not has_room(path):
-        return
     keep_pandas_out()
-    recording = RotatedRecording(path, source, folder, time.time())
+    recordings: dict[str, RotatedRecording] = {}
     try:
-        while (report := connection.recv()) is not None and recording.has_room(time.time()):
-            recording.add(report, time.time())
-            connection.send(recording.waiting)
+        while (message := connection.recv()) is not None:
+            name, number, content = message
+            try:
+                answer = _recorded(recordings, name, content)
+            except OSError as error:
+                recordings.pop(name, None)
+                answer = Ended(str(error))
+            if answer is not None:
+                connection.send((name, number, answer))
     finally:
-        recording.close()
+        with ExitStack() as closing:
+            for recording in recordings.values():
+                closing.callback(recording.close)
+
+
+def _recorded(
+    recordings: "dict[str, RotatedRecording]", name: str, content: Opened | Report | None
+) -> int | Ended | None:
+    """Do what a message asks for, and return the answer, if there is one."""
+    if isinstance(content, Opened) or content is None:
+        if name in recordings:
+            recordings.pop(name).close()
+        if content is None:
+            return None
+        if not has_room(content.path):
+            return Ended("")
+        recordings[name] = RotatedRecording(content.path, content.source, content.folder, time.time())
+        return None
+    if name not in recordings:
+        return None  # it has ended, which was answered before
+    if not recordings[name].has_room(time.time()):
+        recordings.pop(name).close()
+        return Ended("")
+    recordings[name].add(content, time.time())
+    return recordings[name].waiting
 
 
 def has_room(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 import os
 import resource
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -90,8 +90,8 @@ class Access:
         names = () if table.tls is None else (table.tls.ca, table.tls.certificate, table.tls.key)
         return tuple(_stamp(folder / name) for name in (*names, table.access.passwords) if name is not None)
 
-    def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, Validity]:
-        """Return settings to publish below ``prefix``, and their validity.
+    def settings(self, prefixes: Sequence[str], listen: Iterable[str]) -> tuple[Settings, Validity]:
+        """Return settings to publish below ``prefixes``, and their validity.
 
         Raises:
             NotValidNowError: an endpoint needs a certificate that is not valid now.
@@ -104,7 +104,7 @@ class Access:
         except ConfigurationError as error:
             place = Context(read(self.path)).file.place(error.key)
             raise type(error)(f"{place}: {error}", error.key) from error
-        return {**_limits(), **encryption, **passwords, "access_control": self._control(prefix)}, validity
+        return {**_limits(), **encryption, **passwords, "access_control": self._control(prefixes)}, validity
 
     def _encryption(self, listen: tuple[str, ...]) -> tuple[Settings, Validity]:
         """Settings of TLS, once its files have been checked, and until when its certificate is valid."""
@@ -152,16 +152,18 @@ class Access:
             _login(line, f"{path}:{number}", key)
         return {"transport/auth/usrpwd": {"dictionary_file": str(path)}}
 
-    def _control(self, prefix: str) -> Settings:
+    def _control(self, prefixes: Sequence[str]) -> Settings:
         """Zenoh's access control: everything is denied but reading what this daemon publishes.
 
         A peer relays what others put, delete, declare and answer. Here it receives subscriptions and queries only, and
-        sends only keys below its own ``prefix``. ``@adv`` has the messages of Zenoh's advanced publisher.
+        sends only keys below its own ``prefixes``. ``@adv`` has the messages of Zenoh's advanced publisher.
         """
         published = ["put", "reply", "liveliness_token", "declare_queryable"]
         requested = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
         rules = [
-            _rule("publish", "egress", published, [f"{prefix}/**", f"{prefix}/**/@adv/**"]),
+            _rule(
+                "publish", "egress", published, [f"{each}/{rest}" for each in prefixes for rest in ("**", "**/@adv/**")]
+            ),
             _rule("read", "ingress", requested, ["**", "**/@adv/**"]),
         ]
         readers = self.zenoh.access.readers

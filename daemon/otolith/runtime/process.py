@@ -94,6 +94,27 @@ class _Inbox:
                 log.warning("%s: a message that cannot be read: %s", name, error)
 
 
+class RestartPauses:
+    """Pauses between the restarts of what has ended: the first is immediate, then each takes twice as long."""
+
+    def __init__(self) -> None:
+        self.deaths = 0
+        """How often in a row it has ended, or could not be started, before it did its work."""
+        self._restart_at: float | None = None
+
+    def is_over(self, now: float) -> bool:
+        """Return whether it may be started again; ``now`` is monotonic time, s."""
+        if self._restart_at is None:
+            pause = FIRST_RESTART_PAUSE * 2 ** (self.deaths - 1) if self.deaths else 0.0
+            self.deaths = min(self.deaths + 1, 16)
+            self._restart_at = now + min(pause, MAX_RESTART_PAUSE)
+        return now >= self._restart_at
+
+    def begin(self) -> None:
+        """It was started, or the restart failed: count its next end."""
+        self._restart_at = None
+
+
 class ChildProcess:
     """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a child process.
 
@@ -104,9 +125,8 @@ class ChildProcess:
         self.name = name
         self.starts = 0
         self._main, self._room = main, room
-        self._deaths = 0
+        self._pauses = RestartPauses()
         self._started_at = 0.0
-        self._restart_at: float | None = None
         self._process: Any = None
         self._inbox: _Inbox | None = None
         self._outbox: queue.Queue[Any] = queue.Queue(room)
@@ -115,7 +135,8 @@ class ChildProcess:
         """Spawn the process; messages for an earlier one are dropped. A failure to spawn counts as a death."""
         self._release()
         self.starts += 1
-        self._restart_at, self._started_at = None, time.monotonic()
+        self._pauses.begin()
+        self._started_at = time.monotonic()
         try:
             self._spawn(arguments)
         except (OSError, RuntimeError) as error:  # out of descriptors, processes, threads or memory: may be temporary
@@ -157,7 +178,7 @@ class ChildProcess:
     @property
     def deaths(self) -> int:
         """How often in a row the process has ended, or could not be started, before it did its work."""
-        return self._deaths
+        return self._pauses.deaths
 
     @property
     def age(self) -> float:
@@ -183,22 +204,18 @@ class ChildProcess:
         """Return whether the process is dead and its restart pause is over; ``now`` is monotonic time, s."""
         if self.alive:
             return False
-        if self._restart_at is None:
-            if self._process is not None and self._process.exitcode != 0:
-                log.warning("%s has ended with code %s, and is started again", self.name, self._process.exitcode)
-                self._release()  # so that a start that fails does not log this again
-            pause = FIRST_RESTART_PAUSE * 2 ** (self._deaths - 1) if self._deaths else 0.0
-            self._deaths = min(self._deaths + 1, 16)
-            self._restart_at = now + min(pause, MAX_RESTART_PAUSE)
-        return now >= self._restart_at
+        if self._process is not None and self._process.exitcode not in (0, None):
+            log.warning("%s has ended with code %s, and is started again", self.name, self._process.exitcode)
+            self._release()  # so that it is logged once, also if a start fails
+        return self._pauses.is_over(now)
 
     def count_failed_start(self) -> None:
         """Count a restart that the caller could not prepare as a death, so that the pause doubles."""
-        self._restart_at = None
+        self._pauses.begin()
 
     def reset_backoff(self) -> None:
         """Let the next restart be immediate again, because the process has done its work."""
-        self._deaths = 0
+        self._pauses.deaths = 0
 
     def offer(self, message: Any) -> bool:
         """Queue a message without waiting; return False if the queue is full and the message was dropped."""

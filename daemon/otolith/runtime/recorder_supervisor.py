@@ -14,8 +14,16 @@ from typing import TYPE_CHECKING
 
 from otolith.health.schema import Report
 from otolith.runtime.effort import Effort
-from otolith.runtime.process import ChildProcess
-from otolith.storage.recording_files import DAY, GIGABYTE, MEGABYTE, RESUME_FACTOR, RecordingBudget, RecordingFolder
+from otolith.runtime.hall.recorder_process import RECORDER_ROOM, RecorderProcess
+from otolith.storage.recording_files import (
+    DAY,
+    GIGABYTE,
+    MEGABYTE,
+    RESUME_FACTOR,
+    Opened,
+    RecordingBudget,
+    RecordingFolder,
+)
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.user_dirs import writable
 
@@ -25,7 +33,6 @@ if TYPE_CHECKING:  # slow to import
 log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 RECORDER_TIMEOUT = 60.0  # s of effort without an answer, while windows wait, after which the recorder hangs
 FOLDER_TIMEOUT = 60.0  # s without an answer of the disk after which it hangs
@@ -65,17 +72,24 @@ class _Preparation:
 class RecorderSupervisor:
     """The recorder of one machine. Times are monotonic, s."""
 
-    def __init__(self, machine: "LoadedMachine", path: Path | None = None) -> None:
-        """The first recording is ``path`` instead of files in the folder of the machine."""
+    def __init__(
+        self, machine: "LoadedMachine", path: Path | None = None, process: RecorderProcess | None = None
+    ) -> None:
+        """The first recording is ``path`` instead of files in the folder of the machine.
+
+        Several machines may share a ``process``.
+        """
         self._machine, self._path = machine, path
-        self._process = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
+        self._whole = RecorderProcess() if process is None else process
+        identity = machine.file.machine
+        self._process = self._whole.share(f"{identity.site}.{identity.name}")
         self._preparation: _Preparation | None = None
         self._early: list[Report] = []  # Windows since the start of the preparation of the first file
         self._unanswered = self._unwritten = 0
         self._planned_starts = 1
         self._effort = Effort()  # since the last answer
         self._problem = ""
-        self._first: tuple[object, ...] | None = None  # arguments of the process, until it is spawned
+        self._first: Opened | None = None  # What the process is started with, until it is spawned
         self.dropped = 0  # Windows that were not recorded
 
     @property
@@ -117,9 +131,9 @@ class RecorderSupervisor:
 
         self._preparation = _Preparation(prepare, now)
 
-    def reload(self, machine: "LoadedMachine", now: float, seconds: float) -> None:
-        """Go on with a new file and the changed machine file; the old one is finished in up to ``seconds``."""
-        self._process.stop(seconds)
+    def reload(self, machine: "LoadedMachine", now: float) -> None:
+        """Go on with a new file and the changed machine file; the old one is finished."""
+        self._process.finish()
         self._unanswered = self._unwritten = 0
         self._machine, self._first, self._preparation = machine, None, None
         if self.is_enabled:
@@ -133,7 +147,7 @@ class RecorderSupervisor:
             self._early.append(report)
             return
         if self._first is not None:
-            self._process.start(*self._first)
+            self._process.start(self._first)
             self._first = None
         self._give(report, now)
 
@@ -161,7 +175,7 @@ class RecorderSupervisor:
 
     def stop(self, seconds: float) -> None:
         """Let the recorder write what it has for up to ``seconds``."""
-        self._process.stop(seconds)
+        self._whole.stop(seconds)
 
     def _give(self, report: Report, now: float) -> None:
         if not (self._process.alive and self._process.offer(report)):
@@ -188,14 +202,14 @@ class RecorderSupervisor:
         return False
 
     def _launch(self, path: Path, folder: RecordingFolder | None, now: float) -> None:
-        arguments = (path, self._machine.recorded(self._machine.driver.sampling), folder)
+        arguments = Opened(path, self._machine.recorded(self._machine.driver.sampling), folder)
         self._effort.begin(now, self._process.processor_time)
         if self._problem:  # its deaths were failures of the disk, which works again
             self._process.reset_backoff()
         self._problem = ""
         log.info("recording to %s", path)
         if self._process.starts or self._early:
-            self._process.start(*arguments)
+            self._process.start(arguments)
         else:
             self._first = arguments
         early, self._early = self._early, []

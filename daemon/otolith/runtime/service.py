@@ -1,25 +1,20 @@
-"""The service: builds, starts, supervises and stops the parts of the daemon.
+"""One machine of the service, with its driver and all that its reports go to.
 
     driver thread -> rings -> [main thread] samples -> worker process -> [main thread] report -> Zenoh, recorder process
 
-The main thread never waits for a machine, a worker, a disk, a command or a subscriber. It waits only for a process that
-it has killed and, at the end, for writer thread, recorder and commands, each up to its flush time.
+:mod:`otolith.runtime.hall.daemon` is the main thread: it tells a service when a window of its machine is due, and when
+one is finished. No service waits for a machine, a disk, a command or a subscriber.
 """
 
 import contextlib
 import logging
 import math
-import os
-import signal
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from multiprocessing.connection import wait
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from otolith.adaptation.state import (
@@ -36,30 +31,29 @@ from otolith.health.status import driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access
-from otolith.publishing.zenoh_session import StartDocument, protect_files
+from otolith.publishing.zenoh_session import StartDocument
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
-from otolith.runtime.hall.machine import MAX_WAIT, Machine, Task
-from otolith.runtime.hall.pool import Pool, Preparation
-from otolith.runtime.process import SIGNALS, EventCommand
+from otolith.runtime.hall.machine import FinishedWindow, Machine, Task
+from otolith.runtime.hall.pool import Preparation
+from otolith.runtime.hall.recorder_process import RecorderProcess
+from otolith.runtime.process import EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
+from otolith.storage.disk import StorageThread
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import history_of
 from otolith.storage.state_store import LockedError, StateWriter, store_of
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import OtolithError, ServiceError
-from otolith_drivers.outside_text import visible
 
 log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
-MAX_STATUS = 1000  # characters of a line for systemd, beyond which it is cut: a datagram that is too long is not sent
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
 _WORDING: set[Key] = {("machine", "language"), ("machine", "timezone")}  # what texts of limits and rules depend on
@@ -127,37 +121,16 @@ def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
         yield key
 
 
-class Notifier:
-    """Notifications to systemd, sd_notify(3), without its C library. Without systemd it sends nothing."""
+@dataclass(frozen=True, slots=True)
+class SharedParts:
+    """What the machines of a hall have in common."""
 
-    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        path = environment.get("NOTIFY_SOCKET", "")
-        self._address = "\0" + path[1:] if path.startswith("@") else path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if path else None
-        microseconds, pid = environment.get("WATCHDOG_USEC"), environment.get("WATCHDOG_PID")
-        for_us = pid in (None, str(os.getpid()))
-        self.watchdog = float(microseconds) / 1e6 if for_us and microseconds and microseconds.isdigit() else None
-        """Timeout of systemd's watchdog in s, or None if there is no watchdog."""
-
-    def send(self, *assignments: str) -> None:
-        """Send assignments such as ``READY=1``; line breaks in them are escaped, as each line is an assignment."""
-        if self._socket is None:
-            return
-        text = "\n".join(visible(assignment, MAX_STATUS) for assignment in assignments)
-        try:  # MSG_DONTWAIT: a full queue must not block; a dropped message is repeated by the next one
-            self._socket.sendmsg([text.encode()], [], socket.MSG_DONTWAIT, self._address)
-        except OSError:
-            return
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+    recorder: RecorderProcess
+    storage: StorageThread
 
 
 class Service:
-    """One machine, from :meth:`run` to the signal that stops it."""
+    """One machine, its driver and its outputs; :mod:`otolith.runtime.hall.daemon` starts, asks and stops them."""
 
     def __init__(
         self,
@@ -165,14 +138,16 @@ class Service:
         listen: tuple[str, ...] | None = None,
         recording: Path | None = None,
         clocks: Callable[[], ClockReading] = read_clocks,
+        shared: SharedParts | None = None,
     ) -> None:
         """``listen`` and ``recording`` replace the endpoints and the recording file that the machine file gives.
 
-        ``clocks`` reads the clocks of the computer.
+        ``clocks`` reads the clocks of the computer. A machine of a hall has what is ``shared`` instead of parts of its
+        own, and no line in the log for each of its windows.
         """
         file = machine.file
-        self._loaded, self.machine = machine, Machine.of(machine)
-        self._listen = file.zenoh.listen if listen is None else listen
+        self._loaded, self.machine, self._shared = machine, Machine.of(machine), shared
+        self.listen = file.zenoh.listen if listen is None else listen
         self._store = store_of(machine)
         self._writer = StateWriter(self._store, self._store.operator.time())
         self._history = history_of(file)
@@ -186,50 +161,44 @@ class Service:
         self._saved_at = -math.inf
         self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
         self._described: MonitoringPlan | None = None  # by the history
-        self._pool = Pool([self.machine])
-        self._recorder = RecorderSupervisor(machine, recording)
+        self._recorder = RecorderSupervisor(machine, recording, None if shared is None else shared.recorder)
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
-        self._notifier = Notifier()
-        self._preparation: Preparation | None = None  # As it was shown
-        self._stop_signal: int | None = None
-        self._is_reload_due = False
-        self._started_at = self._fed_at = 0.0
+        self._started_at = 0.0
         self._summarised_at = -math.inf
         self._logged: ReportDocument | None = None  # The last report with a line in the log
+        for writer in (self._writer, self._history, self._evidence):
+            if shared is not None and writer is not None:
+                writer.share(shared.storage)
 
-    def run(self) -> int:
-        """Serve until SIGTERM or SIGINT, or in a terminal SIGHUP, and return the number of that signal.
+    @property
+    def title(self) -> str:
+        """Site and name of the machine, with a point between."""
+        identity = self._loaded.file.machine
+        return f"{identity.site}.{identity.name}"
+
+    @property
+    def access(self) -> Access:
+        """Who may read its reports."""
+        return Access(self._loaded.file.zenoh, self._loaded.path)
+
+    @property
+    def published(self) -> Published:
+        """What its publisher must know of it."""
+        identity = self._loaded.file.machine
+        return Published(identity.site, identity.name, self._history)
+
+    @property
+    def locked_out(self) -> LockedError | None:
+        """Another process has taken the state of this machine, which its writer notices."""
+        return self._writer.locked_out
+
+    def prepare(self) -> None:
+        """Continue what the daemon before has learned.
 
         Raises:
-            DeviceError: the machine's bus cannot be opened.
-            ConfigurationError: a file for the encryption of reports is wrong.
-            ServiceError: another daemon runs for the machine, or a file that the caller named cannot be recorded.
+            LockedError: another daemon runs for the machine.
         """
-        for number in SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
-                signal.signal(number, self._on_signal)
-        try:
-            self._start()
-            while self._stop_signal is None:
-                self._step()
-                if self._writer.locked_out is not None:
-                    raise self._writer.locked_out
-                if self._is_reload_due:
-                    self._reload()
-        finally:
-            self._stop()
-        return self._stop_signal or 0
-
-    def _on_signal(self, number: int, _: FrameType | None) -> None:
-        if number == signal.SIGHUP and not os.isatty(0):  # in a terminal it means that the terminal is closed
-            self._is_reload_due = True
-        else:
-            self._stop_signal = number
-
-    def _start(self) -> None:
-        sys.setswitchinterval(SWITCH_INTERVAL)
-        protect_files()
         try:
             self._store.lock_or_later()
         except LockedError:
@@ -239,37 +208,48 @@ class Service:
         self._start_clock()
         self.machine.state = self._restored(self.machine.state)
         self._start_history()
-        identity, driver = self._loaded.file.machine, self._loaded.driver
-        access = Access(self._loaded.file.zenoh, self._loaded.path)
-        self._publisher = Publisher(identity.site, identity.name, self._listen, access, self._history)
+
+    def open(self, publisher: Publisher) -> str:
+        """Listen to the machine, and return where, in words.
+
+        Raises:
+            DeviceError: the machine's bus cannot be opened.
+            ServiceError: a file that the caller named cannot be recorded.
+        """
+        self._publisher = publisher
+        driver = self._loaded.driver
         driver.open(self.machine.rings.deliver)
         self._writer.start()
         self._evidence.start()
-        self._pool.start(time.monotonic())
         if self._recorder.is_enabled:
             self._recorder.start(time.monotonic())
         self._started_at = time.monotonic()
         self.machine.begin(self._started_at)
-        self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
-        log.info("machine %s, %s: reports on %s", identity.name, self._loaded.twin.title, self._publisher.endpoints)
+        name, twin = self._loaded.file.machine.name, self._loaded.twin.title
+        log.info("machine %s, %s: reports on %s", name, twin, publisher.endpoints)
+        return str(driver.describe()[0])
 
-    def _stop(self) -> None:
-        """Stop every part, even if stopping another one fails; the last callback runs first."""
-        with contextlib.ExitStack() as steps:
-            steps.callback(self._store.unlock)
-            steps.callback(self._notifier.close)
-            if self._publisher is not None:
-                steps.callback(self._publisher.close)
-            if self._history is not None:
-                steps.callback(self._history.stop, WRITER_FLUSH)
-            steps.callback(self._command.stop, COMMAND_FLUSH)
-            steps.callback(self._writer.stop, WRITER_FLUSH)
-            steps.callback(self._evidence.stop, WRITER_FLUSH)
+    def stop_outputs(self, steps: contextlib.ExitStack) -> None:
+        """Add to ``steps`` how every output is stopped, even if stopping another one fails; the last runs first."""
+        if self._history is not None:
+            steps.callback(self._history.stop, WRITER_FLUSH)
+        steps.callback(self._command.stop, COMMAND_FLUSH)
+        steps.callback(self._writer.stop, WRITER_FLUSH)
+        steps.callback(self._evidence.stop, WRITER_FLUSH)
+        if self._shared is None:
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
-            steps.callback(self._pool.kill)
-            steps.callback(self._loaded.driver.close)
-            self._save(math.inf)
-            self._notifier.send("STOPPING=1")
+
+    def close_driver(self) -> None:
+        """Listen no longer."""
+        self._loaded.driver.close()
+
+    def save_last(self) -> None:
+        """Request that what was learned is saved."""
+        self._save(math.inf)
+
+    def unlock(self) -> None:
+        """Let another daemon serve the machine."""
+        self._store.unlock()
 
     def _start_clock(self) -> None:
         """Continue the service time of the daemon before, as its state or its history have it."""
@@ -332,9 +312,8 @@ class Service:
             self.machine.state = replace(state, health=health)
             self._history.start()
 
-    def _reload(self) -> None:
+    def reload(self) -> None:
         """Take over limits, rules, recording and access from the machine file; if it is invalid, go on as before."""
-        self._is_reload_due = False
         try:
             change = reloaded(self._loaded, load_machine(self._loaded.path))
             files = self._evidence.files if change.needs_restart else files_of(change.machine)
@@ -348,40 +327,21 @@ class Service:
             # The decisions contain the baselines to which limits in percent refer.
             self.machine.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
         if self._publisher is not None:  # also if the files have the same names as before
-            self._publisher.reload(Access(self._loaded.file.zenoh, self._loaded.path))
+            self._publisher.reload(self.access)
         if change.recording:
-            self._recorder.reload(self._loaded, time.monotonic(), RECORDER_FLUSH)
+            self._recorder.reload(self._loaded, time.monotonic())
 
-    def _step(self) -> None:
-        """Hand the samples of due windows to the worker, publish finished reports, supervise the processes."""
-        now = time.monotonic()
-        while (due := self.machine.due_at(now)) <= now:
-            self._take(now)
-        wait(self._pool.waitables, timeout=min(MAX_WAIT, due - now))
-        for _, finished in self._pool.poll(time.monotonic()):
-            self._evidence.add(finished.before, finished.window, finished.report, finished.after)
-            self._publish(finished.report, finished.seconds)
-            self._save(time.monotonic())
-        self._show_preparation()
-        self._feed_watchdog(time.monotonic())
-        if self._recorder.is_enabled:
-            self._recorder.poll(time.monotonic())
-
-    def _show_preparation(self) -> None:
-        """Tell readers and systemd how many kernels a worker has that is not ready: until then there is no report."""
-        if (now := self._pool.preparation) == self._preparation:
+    def show_preparation(self, shown: Preparation, *, is_done: bool) -> None:
+        """Tell readers how many kernels the workers have: until they are ready there is no report."""
+        if self._publisher is None:
             return
-        before, self._preparation = self._preparation, now
-        shown = now or before
-        if shown is None or self._publisher is None:
-            return
-        identity, done = self._loaded.file.machine, shown.total if now is None else shown.done
-        self._notifier.send(f"STATUS={shown.text if now else 'the first window is computed'}")
+        identity, done = self._loaded.file.machine, shown.total if is_done else shown.done
         self._publisher.publish_start(
             StartDocument(site=identity.site, machine=identity.name, done=done, total=shown.total, text=shown.text)
         )
 
-    def _take(self, now: float) -> None:
+    def take(self, now: float) -> Task:
+        """Return the window of the machine that is due."""
         self._follow_wall_clock()
         link = self._loaded.driver.link()
         raw = self.machine.take(link, self._clock.offset, self._clock.ahead)
@@ -390,7 +350,19 @@ class Service:
         decisions = self._writer.new_decisions()
         if decisions is not None:
             self.machine.revise(lambda state: self._decided(state, decisions))
-        self._pool.submit(self.machine, Task(raw, link, self._outages(now)), now)
+        return Task(raw, link, self._outages(now))
+
+    def finish(self, finished: FinishedWindow, restarts: int) -> str:
+        """Save, keep and publish a window; return its line. ``restarts`` is how often workers were started again."""
+        self._evidence.add(finished.before, finished.window, finished.report, finished.after)
+        line = self._publish(finished.report, finished.seconds, restarts)
+        self._save(time.monotonic())
+        return line
+
+    def poll_recorder(self, now: float) -> None:
+        """Read what the recorder answers, and start it again if it must be."""
+        if self._recorder.is_enabled:
+            self._recorder.poll(now)
 
     def _outages(self, now: float) -> dict[str, str]:
         """Return the outputs that have failed for ``OUTAGE_AFTER``, and why; the machine is monitored without them."""
@@ -414,14 +386,14 @@ class Service:
             event = clock_event(self._clock.now(), by, self.machine.windows, self._loaded.file.machine.language)
             self._noted = (*self._noted, event)
 
-    def _publish(self, report: Report, seconds: float) -> None:
+    def _publish(self, report: Report, seconds: float, restarts: int = 0) -> str:
         document, noted = report.document, self._noted
         self._noted, warning = (), "" if self._publisher is None else self._publisher.warning(datetime.now(UTC))
         latency = max(0.0, self._clock.now() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         driver = driver_document(self._loaded.driver.link())
         parameters = with_absent_sources(document.parameters, document.window.absent)
-        update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
+        update = {"cost": cost, "counters": self._counters(restarts), "driver": driver, "parameters": parameters}
         update["events"] = (*noted, *document.events)
         update["notes"] = (*self._notes, *filter(None, [warning]))
         document = self.machine.numbers.number(document.model_copy(update=update))
@@ -434,7 +406,7 @@ class Service:
             self._publisher.publish(document)
         if self._recorder.is_enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
-        self._log(document, time.monotonic())
+        return self._log(document, time.monotonic())
 
     def _describe(self) -> None:
         """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
@@ -444,7 +416,7 @@ class Service:
             text = describe_machine(machine.twin, plan, None, machine.path, dict(machine.problem.known))
             self._history.description, self._described = text, plan
 
-    def _counters(self) -> CountersDocument:
+    def _counters(self, restarts: int) -> CountersDocument:
         rings, driver = self.machine.rings.counters(), self._loaded.driver.counters()
         return CountersDocument(
             received=rings.received,
@@ -454,7 +426,7 @@ class Service:
             windows=self.machine.windows,
             windows_bad=self.machine.bad,
             windows_missed=self.machine.missed,
-            worker_restarts=self._pool.restarts,
+            worker_restarts=restarts,
             recordings_dropped=self._recorder.dropped,
             recorder_restarts=self._recorder.restarts,
             history_dropped=0 if self._history is None else self._history.dropped,
@@ -462,10 +434,10 @@ class Service:
             commands_failed=self._command.failed,
         )
 
-    def _log(self, document: ReportDocument, now: float) -> None:
+    def _log(self, document: ReportDocument, now: float) -> str:
         """Log the events that the window changed, and run the command for those that are not silent.
 
-        A window is logged once per hour, in a terminal each.
+        A window is logged once per hour, in a terminal each of a machine that is alone. Returns its line.
         """
         for event in announcements(document):
             level = logging.ERROR if event.is_urgent else logging.WARNING
@@ -477,8 +449,9 @@ class Service:
         self._summarised_at = now if is_due else self._summarised_at
         if is_due and self._publisher is not None:
             self._warn_of_expiry(self._publisher, datetime.now(UTC))
-        self._notifier.send(f"STATUS={line}")
-        log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line if is_due else short)
+        is_shown = is_due or (self._shared is None and sys.stderr.isatty())
+        log.log(logging.INFO if is_shown else logging.DEBUG, "%s", line if is_due else short)
+        return line
 
     def _warn_of_expiry(self, publisher: Publisher, now: datetime) -> None:
         """Log that the certificate of an endpoint expires soon, and note it in the next report."""
@@ -501,13 +474,6 @@ class Service:
         if keys != self._saved or now - self._saved_at >= SAVE_INTERVAL:
             self._writer.save(self._unsaved)
             self._saved, self._saved_at, self._unsaved = keys, now, None
-
-    def _feed_watchdog(self, now: float) -> None:
-        """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
-        stalled = self._pool.is_stalled(now)
-        if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
-            self._fed_at = now
-            self._notifier.send("WATCHDOG=1")
 
 
 def _keys(state: AdaptationState) -> tuple[str, ...]:

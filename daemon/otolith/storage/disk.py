@@ -4,12 +4,14 @@ After an error the thread tries again. What root writes belongs to the owner of 
 """
 
 import contextlib
+import heapq
 import logging
 import os
 import sqlite3
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,24 +30,38 @@ class WriterThread(ABC):
 
     def __init__(self, name: str, interval: float, loss: str) -> None:
         """``interval`` in s; ``loss`` names for the log what an error keeps from being written."""
-        self._interval, self._loss = interval, loss
+        self.interval, self._loss = interval, loss
         self._wakeup, self._stopping = threading.Event(), threading.Event()
         self._retry_at, self._last_error = 0.0, ""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._shared: StorageThread | None = None
 
     @property
     def outage(self) -> str:
         """Why the last try wrote nothing; empty if it did."""
         return f"{self._loss}: {self._last_error}" if self._last_error else ""
 
+    def share(self, thread: "StorageThread") -> None:
+        """Let :meth:`start` take a thread that several writers share, instead of one of its own."""
+        self._shared = thread
+
     def start(self) -> None:
         """Start the thread."""
-        self._thread.start()
+        if self._shared is None:
+            self._thread.start()
+        else:
+            self._shared.add(self)
+
+    def wake(self) -> None:
+        """Let the thread write soon."""
+        self._wakeup.set()
+        if self._shared is not None:
+            self._shared.wake(self)
 
     def stop(self, seconds: float) -> None:
-        """Write what is waiting, for up to ``seconds``, and end the thread."""
+        """Write what is waiting, for up to ``seconds``, and end the thread; a shared one is stopped by its owner."""
         self._stopping.set()
-        self._wakeup.set()
+        self.wake()
         if self._thread.is_alive():
             self._thread.join(seconds)
             if self._thread.is_alive():
@@ -68,21 +84,83 @@ class WriterThread(ABC):
             log.warning("%s: %s", self._loss, text)
         self._last_error, self._retry_at = text, time.monotonic() + WRITE_RETRY
 
-    def _run(self) -> None:
-        while True:
-            self._wakeup.wait(self._interval)
-            self._wakeup.clear()
-            is_last = self._stopping.is_set()
-            if is_last or time.monotonic() >= self._retry_at:
-                try:
-                    self.write()
-                except Exception as error:  # noqa: BLE001 - OSError, sqlite3.Error, OtolithError, or a bug: none ends it
-                    self.fail(error)
-                else:
-                    self._last_error, self._retry_at = "", 0.0
-            if is_last:
-                return
+    def turn(self) -> bool:
+        """Write and read once; return whether it was the last time."""
+        self._wakeup.clear()
+        is_last = self._stopping.is_set()
+        if is_last or time.monotonic() >= self._retry_at:
+            try:
+                self.write()
+            except Exception as error:  # noqa: BLE001 - OSError, sqlite3.Error, OtolithError, or a bug: none ends it
+                self.fail(error)
+            else:
+                self._last_error, self._retry_at = "", 0.0
+        if not is_last:
             self.read()
+        return is_last
+
+    def _run(self) -> None:
+        is_last = False
+        while not is_last:
+            self._wakeup.wait(self.interval)
+            is_last = self.turn()
+
+
+class StorageThread:
+    """A thread that several writers share: the machines of a hall have one."""
+
+    def __init__(self) -> None:
+        self._wakeup, self._woken = threading.Event(), deque[WriterThread]()
+        self._due: list[tuple[float, int, WriterThread]] = []  # Only this thread uses it, as the next line
+        self._running: dict[WriterThread, float] = {}  # When each has its next turn without being woken, monotonic s
+        self._added = 0
+        self._is_stopping = False
+        self._thread = threading.Thread(target=self._run, name="storage", daemon=True)
+
+    def add(self, writer: WriterThread) -> None:
+        """Let it write for a further writer, from now on."""
+        self.wake(writer)
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def wake(self, writer: WriterThread) -> None:
+        """Let a writer write soon."""
+        self._woken.append(writer)
+        self._wakeup.set()
+
+    def stop(self, seconds: float) -> None:
+        """Wait up to ``seconds`` until all writers, which were stopped before, have written what is waiting."""
+        self._is_stopping = True
+        self._wakeup.set()
+        if self._thread.is_alive():
+            self._thread.join(seconds)
+            if self._thread.is_alive():
+                log.warning("writing took over %.1f s: check the disk", seconds)
+
+    def _run(self) -> None:
+        while not self._is_stopping or self._woken:
+            rest = self._due[0][0] - time.monotonic() if self._due else None
+            self._wakeup.wait(rest if rest is None or rest > 0.0 else 0.0)
+            self._wakeup.clear()
+            woken = [self._woken.popleft() for _ in range(len(self._woken))]
+            for writer in dict.fromkeys([*woken, *self._expired()]):
+                if writer.turn():
+                    self._running.pop(writer, None)
+                else:
+                    self._plan(writer)
+
+    def _plan(self, writer: WriterThread) -> None:
+        self._running[writer] = time.monotonic() + writer.interval
+        self._added += 1
+        heapq.heappush(self._due, (self._running[writer], self._added, writer))
+
+    def _expired(self) -> Iterator[WriterThread]:
+        """Yield the writers whose interval is over; one that wrote meanwhile has a later turn."""
+        now = time.monotonic()
+        while self._due and self._due[0][0] <= now:
+            due, _, writer = heapq.heappop(self._due)
+            if self._running.get(writer) == due:
+                yield writer
 
 
 def reason_of(error: Exception) -> str:

@@ -341,7 +341,7 @@ class EvidenceWriter(WriterThread):
                 VERSION, self._versions, self._unmeasured, events, self._states[0], (*self._older, *self._newer)
             )
             self._waiting += [] if is_full else [bundle]
-            self._wakeup.set()
+            self.wake()
 
     def write(self) -> None:
         """Write the bundles that wait."""

@@ -226,7 +226,7 @@ class HistoryWriter(WriterThread):
             self._waiting.append(document)
             if not self._last_error:
                 self._written.clear()
-        self._wakeup.set()
+        self.wake()
 
     def last_changes(self) -> dict[str, EventDocument]:
         """Return what :meth:`HistoryReader.last_changes` does; nothing without a database."""

@@ -13,8 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from otolith_drivers.user_dirs import writable
+
+if TYPE_CHECKING:  # slow to import
+    from otolith.machine import RecordedMachine
 
 log = logging.getLogger(__name__)
 
@@ -163,3 +167,18 @@ class RecordingFolder:
                     file.path.rename(path)
                     current = path if file.path == current else current
         return current
+
+
+class Opened(NamedTuple):
+    """Begins a recording in the recorder process: of one machine, in place of the one before."""
+
+    path: Path
+    source: "RecordedMachine"
+    folder: RecordingFolder | None
+    """Without one all goes into the file ``path``."""
+
+
+class Ended(NamedTuple):
+    """A recording has ended, because of its disk or its file."""
+
+    reason: str

@@ -376,7 +376,7 @@ class StateWriter(WriterThread):
     def save(self, state: AdaptationState) -> None:
         """Request that ``state`` replaces what is on disk."""
         self._to_save.append(state)
-        self._wakeup.set()
+        self.wake()
 
     def new_decisions(self) -> OperatorDecisions | None:
         """Return the operator's decisions if they have changed since the last call, otherwise None."""

@@ -85,6 +85,8 @@ class Machine:
         self.finished = 0
         self.current: Task | None = None
         """The window that a worker computes."""
+        self.is_slow = False
+        """Whether its last window was computed for longer than it lasts."""
         self._waiting: deque[Task] = deque()
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._started_at = 0.0
@@ -150,6 +152,7 @@ class Machine:
         if task is None or task.index != result.window_index:
             return None
         self.current = None
+        self.is_slow = result.seconds > self.windower.length
         self.bad += result.window is not None and result.window.quality.verdict is Verdict.BAD
         if result.report is None or result.window is None:
             self._miss(task, result.failure)
@@ -164,6 +167,7 @@ class Machine:
         task, self.current = self.current, None
         if task is None:
             return
+        self.is_slow = True
         if task.index == self._retried:
             self._miss(task, "its worker died twice")
         else:

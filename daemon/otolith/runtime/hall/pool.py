@@ -140,7 +140,7 @@ class Pool:
     def start(self, now: float) -> None:
         """Start the workers."""
         for worker in self.workers:
-            worker.start(self._machines[0].state)
+            self._start(worker)
             worker.stall.begin(now, worker.process.processor_time)
 
     def submit(self, machine: Machine, task: Task, now: float) -> None:
@@ -156,7 +156,7 @@ class Pool:
             if not worker.process.alive:
                 self._put_back(worker)
                 if worker.process.may_restart(now):
-                    worker.start(self._machines[0].state)
+                    self._start(worker)
             elif worker.machine is not None and worker.machine.current is not None and worker.hangs(now):
                 what = f"the worker has not finished window {worker.machine.current.index}"
                 seconds = worker.allowed_seconds(worker.machine.longest)
@@ -218,7 +218,21 @@ class Pool:
         if machine.is_waiting and machine not in self._queue:
             self._queue.append(machine)
 
+    def _start(self, worker: Worker) -> None:
+        """Start a worker; if the twin of a machine kills it meanwhile, the next one begins with another machine."""
+        worker.start(self._machines[worker.process.starts % len(self._machines)].state)
+
     def _dispatch(self, now: float) -> None:
         for worker in self.workers:
-            if self._queue and worker.is_free:
-                worker.take(self._queue.popleft(), now)
+            if worker.is_free and (machine := self._next()) is not None:
+                worker.take(machine, now)
+
+    def _next(self) -> Machine | None:
+        """Return the machine whose turn it is; those that compute for long leave one of several workers to the rest."""
+        busy = sum(worker.machine is not None and worker.machine.is_slow for worker in self.workers)
+        may_be_slow = busy < max(1, len(self.workers) - 1)
+        for machine in self._queue:
+            if may_be_slow or not machine.is_slow:
+                self._queue.remove(machine)
+                return machine
+        return None

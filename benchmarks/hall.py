@@ -1,0 +1,252 @@
+"""A hall of machines in one daemon: what it costs, and whether every report is on time.
+
+    python -m benchmarks.hall --machines 20 --machines 50 --seconds 60
+
+Each machine is a DC motor whose record of 100 Hz is replayed in real time, in windows of 2 s; a share of them has a
+winding that loses turns. The daemon is ``otolith run FOLDER``, as it is installed. Measured are, from the moment at
+which all workers are ready: processor time and memory (PSS, of all its processes), the latency of reports (from the end
+of a window until it is published) and the windows that were missed. Exponents say how the costs grow with the number
+of machines.
+"""
+
+import contextlib
+import csv
+import json
+import math
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+
+import click
+import numpy as np
+import psutil
+from rich.table import Table
+
+from benchmarks.command_line import print_pages
+from otolith.health.schema import CountersDocument, ReportDocument
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_config import Connection
+from otolith_drivers.plant.scenario import load_scenario, simulate
+
+CONFIG = Path(__file__).parents[1] / "config"
+SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
+RATE = 100  # records per second
+SETTLING = 10.0  # s from the first report of the last machine until it is measured
+PATIENCE = 300.0  # s until the first report of the last machine
+MACHINE = """[machine]
+name = "{name}"
+site = "hall"
+[driver]
+type = "replay"
+file = "{record}.csv"
+repeat = true
+[signals]
+V_a = {{}}
+T_load = {{}}
+i = {{}}
+omega = {{}}
+[twin]
+name = "dc_motor"
+[parameters]
+D = {{ value = "0.00143 N*m*s/rad", estimate = true }}
+[parameters.R_a]
+value = "6.5 ohm"
+estimate = true
+low = "3 ohm"
+high = "12 ohm"
+watch = ["-2 %", "+45 %"]
+act = ["-5 %", "+65 %"]
+[noise]
+i = "5 mA"
+omega = "0.02 rad/s"
+T_load = "0.2 mN*m"
+[zenoh]
+listen = ["{endpoint}"]
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class HallFigures:
+    """What one hall cost."""
+
+    machines: int
+    seconds: float  # Measured
+    cores: float  # Processor time of all processes, per second
+    pss_mb: float
+    pss_of_each_mb: tuple[float, ...]  # First the process that acquires
+    threads: int  # Of the process that acquires
+    latency_median_ms: float
+    latency_99_ms: float
+    latency_max_ms: float
+    reports: int
+    windows_missed: int
+    samples_lost: int
+    history_kb_per_machine_hour: float
+    recording_kb_per_machine_hour: float
+
+
+def write_records(folder: Path, seconds: float) -> None:
+    """Write the records of a healthy and of a faulty motor."""
+    scenario = load_scenario(CONFIG / "scenarios" / "demo.toml")
+    records = {"healthy": scenario.model_copy(update={"faults": ()}), "faulty": scenario}
+    for name, each in records.items():
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as stream:
+            rows = csv.writer(stream)
+            rows.writerow(["t", *SIGNALS])
+            for number, tick in enumerate(islice(simulate(each), round(seconds * RATE))):
+                rows.writerow(
+                    [f"{number / RATE:.2f}", *(f"{tick.measured[signal]:.6g}" for signal in SIGNALS.values())]
+                )
+
+
+def write_hall(folder: Path, machines: int, faulty: float, endpoint: str) -> Path:
+    """Write the machine files of a hall, and return their folder."""
+    hall = folder / f"hall-{machines}"
+    hall.mkdir()
+    for name in ("healthy", "faulty"):
+        (hall / f"{name}.csv").symlink_to(folder / f"{name}.csv")
+    for number in range(machines):
+        record = "faulty" if number < faulty * machines else "healthy"
+        text = MACHINE.format(name=f"motor-{number:03d}", record=record, endpoint=endpoint)
+        (hall / f"motor-{number:03d}.toml").write_text(text, encoding="utf-8")
+    return hall
+
+
+def pss(process: psutil.Process) -> float:
+    """Return the memory of a process in MB, with its share of what is shared."""
+    lines = Path(f"/proc/{process.pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
+
+
+def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, endpoint: str) -> HallFigures:
+    """Run a daemon for the machines of ``paths``, and return what it cost."""
+    state = folder / f"state-{machines}"
+    environment = {**os.environ, "XDG_STATE_HOME": str(state), "XDG_RUNTIME_DIR": str(folder / "run")}
+    (folder / "run").mkdir(mode=0o700, exist_ok=True)
+    received: queue.SimpleQueue[str] = queue.SimpleQueue()
+    command = [sys.executable, "-m", "otolith", "run", *map(str, paths)]
+    with (folder / f"daemon-{machines}.log").open("wb") as log:
+        daemon = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - our own command
+        try:
+            with Subscriber(Connection((endpoint,)), received.put):
+                _wait_for_all(received, machines, daemon)
+                time.sleep(SETTLING)
+                return _measured(daemon, received, machines, seconds, state)
+        finally:
+            daemon.send_signal(signal.SIGTERM)
+            daemon.wait(timeout=60)
+
+
+def _wait_for_all(received: "queue.SimpleQueue[str]", machines: int, daemon: "subprocess.Popen[bytes]") -> None:
+    """Wait until each machine has a report."""
+    deadline, seen = time.monotonic() + PATIENCE, set[str]()
+    while len(seen) < machines:
+        if daemon.poll() is not None or time.monotonic() > deadline:
+            raise SystemExit(f"only {len(seen)} of {machines} machines have reports")
+        with contextlib.suppress(queue.Empty):
+            seen.add(ReportDocument.from_json(received.get(timeout=1.0)).machine)
+
+
+def _measured(
+    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float, state: Path
+) -> HallFigures:
+    root = psutil.Process(daemon.pid)
+    tree, before = [root, *root.children(recursive=True)], _disk(state)
+    spent, begun, first = sum(sum(each.cpu_times()[:2]) for each in tree), time.monotonic(), received.qsize()
+    time.sleep(seconds)
+    elapsed = time.monotonic() - begun
+    cores = (sum(sum(each.cpu_times()[:2]) for each in tree) - spent) / elapsed
+    memory = [pss(each) for each in tree]
+    documents = [ReportDocument.from_json(received.get()) for _ in range(received.qsize())]
+    earlier = {document.machine: document.counters for document in documents[:first]}
+    documents = documents[first:]
+    latencies = np.array([document.cost.latency_s for document in documents], dtype=np.float64) * 1e3
+    last = {document.machine: document.counters for document in documents}
+    per_hour, after = 3600.0 / elapsed / machines / 1e3, _disk(state)
+
+    def rise(of: Callable[[CountersDocument], int]) -> int:
+        before = sum(of(each) for each in earlier.values() if each is not None)
+        return sum(of(each) for each in last.values() if each is not None) - before
+
+    return HallFigures(
+        machines=machines,
+        seconds=elapsed,
+        cores=cores,
+        pss_mb=sum(memory),
+        pss_of_each_mb=tuple(memory),
+        threads=root.num_threads(),
+        latency_median_ms=float(np.median(latencies)),
+        latency_99_ms=float(np.quantile(latencies, 0.99)),
+        latency_max_ms=float(latencies.max()),
+        reports=len(documents),
+        windows_missed=rise(lambda counters: counters.windows_missed),
+        samples_lost=rise(lambda counters: counters.lost),
+        history_kb_per_machine_hour=(after[0] - before[0]) * per_hour,
+        recording_kb_per_machine_hour=(after[1] - before[1]) * per_hour,
+    )
+
+
+def _disk(state: Path) -> tuple[int, int]:
+    """Return the bytes of histories and of recordings."""
+    folders = [(state / "otolith" / name).glob("*") for name in ("history", "recordings")]
+    history, recordings = (sum(path.stat().st_size for path in files if path.is_file()) for files in folders)
+    return history, recordings
+
+
+def exponents(figures: Sequence[HallFigures]) -> dict[str, float]:
+    """Return how processor time and memory grow with the number of machines: 1 is in proportion to it."""
+    machines = np.log([each.machines for each in figures])
+    return {
+        name: float(np.polyfit(machines, np.log([getattr(each, name) for each in figures]), 1)[0])
+        for name in ("cores", "pss_mb")
+        if len(figures) > 1
+    }
+
+
+@click.command()
+@click.option("--machines", multiple=True, type=click.IntRange(1), default=(1, 20, 50), show_default=True)
+@click.option("--seconds", default=60.0, show_default=True, help="Measured for each hall.")
+@click.option("--faulty", default=0.1, show_default=True, help="Share of the machines with a fault.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON document.")
+def main(machines: tuple[int, ...], seconds: float, faulty: float, as_json: bool) -> None:
+    """Measure halls of machines."""
+    figures = []
+    with tempfile.TemporaryDirectory(prefix="otolith-hall-") as name:
+        folder = Path(name)
+        write_records(folder, 90.0)
+        for count in machines:
+            endpoint = f"unixsock-stream/{folder}/reports-{count}.sock"
+            hall = write_hall(folder, count, faulty, endpoint)
+            paths = [next(hall.glob("*.toml"))] if count == 1 else [hall]
+            figures.append(measure(paths, count, seconds, folder, endpoint))
+            print(asdict(figures[-1]), file=sys.stderr)
+    if as_json:
+        print(json.dumps({"halls": [asdict(each) for each in figures], "exponents": exponents(figures)}, indent=2))
+        return
+    table = Table("machines", "cores", "PSS, MB", "latency 50 / 99 / 100 %, ms", "reports", "missed", "lost samples")
+    for each in figures:
+        latency = f"{each.latency_median_ms:.0f} / {each.latency_99_ms:.0f} / {each.latency_max_ms:.0f}"
+        row = (
+            each.machines,
+            f"{each.cores:.2f}",
+            f"{each.pss_mb:.0f}",
+            latency,
+            each.reports,
+            each.windows_missed,
+            each.samples_lost,
+        )
+        table.add_row(*map(str, row))
+    grown = ", ".join(f"{name} {value:.2f}" for name, value in exponents(figures).items())
+    print_pages(table, f"exponents of machines: {grown or math.nan}")
+
+
+if __name__ == "__main__":
+    main()
