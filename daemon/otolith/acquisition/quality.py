@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from otolith.acquisition.samples import CyclicSeries, SignalPlan
-from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict
+from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict, runs_of
 
 if TYPE_CHECKING:  # slow to import
     from otolith.acquisition.records import Records
@@ -136,10 +136,8 @@ def longest_gap(present: Mask, grid: TimeGrid, start: float, period: float) -> G
     ``present`` (records,) marks the records with a sample; the first record of ``grid`` is at ``start`` (s).
     """
     if grid.period is not None:
-        edges = np.flatnonzero(np.diff(np.concatenate(([False], ~present, [False])).astype(np.int8)))
-        runs = edges[1::2] - edges[::2]
-        at = int(np.argmax(runs)) if len(runs) else 0
-        return Gap(start + float(edges[2 * at]) * period, float(runs[at]) * period) if len(runs) else Gap(start, 0.0)
+        first, last = max(runs_of(~present), key=lambda run: run[1] - run[0], default=(0, 0))
+        return Gap(start + first * period, (last - first) * period)
     times = np.concatenate([[0.0], grid.offsets[present], [grid.length]])
     lengths = np.diff(times) - period * (np.arange(len(times) - 1) > 0)
     at = int(np.argmax(lengths))

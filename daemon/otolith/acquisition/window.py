@@ -208,3 +208,9 @@ class Window:
     def missing_in(self, signal: str) -> Mask:
         """Return where one signal is missing, (records,)."""
         return self.missing[:, self.signals.index(signal)]
+
+
+def runs_of(mask: Mask) -> list[tuple[int, int]]:
+    """Return begin and end of each run of true records."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Mask, Window
+from otolith.acquisition.window import Mask, Window, runs_of
 from otolith.estimation.problem import Problem
 from otolith.twin.expressions import names_in, parse
 from otolith_drivers.units import are_of_one_quantity
@@ -35,7 +35,7 @@ def running_part(problem: Problem, window: Window) -> RunningPart | None:
     off = off_records(problem, window)
     if not off.any():
         return None
-    runs = [(start, end) for start, end in _runs(~off) if end - start >= MIN_ON_SHARE * window.records]
+    runs = [(start, end) for start, end in runs_of(~off) if end - start >= MIN_ON_SHARE * window.records]
     seconds = float(window.grid.steps[off].sum())
     note = f"the drive was switched off for {seconds:.3g} s, in which no equation of the twin holds"
     if not runs:
@@ -53,7 +53,7 @@ def off_records(problem: Problem, window: Window) -> Mask:
         reach = OFF_REACH * problem.noise[index] + (problem.steps[index] if problem.steps else 0.0)
         is_zero = (np.abs(window.readings(current)) <= reach) | window.missing_in(current)
         without = np.all([np.abs(window.column(name)) <= OFF_REACH * levels[name] for name in commands], axis=0)
-        for start, end in _runs(without):
+        for start, end in runs_of(without):
             begin = _end_of_current(is_zero[start:end])
             if end - start - begin >= MIN_OFF:
                 off[start if begin <= SWITCHING else start + begin : end] = True
@@ -77,9 +77,3 @@ def _driven_currents(problem: Problem) -> Iterator[tuple[str, list[str]]]:
         commands = [name for name in volts if rate and name in names_in(parse(rate))]
         if commands and are_of_one_quantity(output.unit, "A"):
             yield output.name, commands
-
-
-def _runs(mask: Mask) -> list[tuple[int, int]]:
-    """Return begin and end of each run of true records."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
-from otolith.acquisition.window import Array, Mask, Verdict, Window
+from otolith.acquisition.window import Array, Mask, Verdict, Window, runs_of
 from otolith.estimation.evidence import CHANCE, chi_square_limit
 from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
@@ -358,9 +358,7 @@ def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices],
     for _ in range(PILE_ROUNDS):
         deviation = max(noise, MAD_TO_SD * median(second[high]) / SECOND_DIFFERENCE_SD)
         high = samples >= top - PILE_WIDTH * deviation
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
-    runs = zip(edges[::2], edges[1::2], strict=True)
-    long = [present[first:end] for first, end in runs if end - first >= MIN_FROZEN_RUN]
+    long = [present[first:end] for first, end in runs_of(high) if end - first >= MIN_FROZEN_RUN]
     return long, deviation if long else noise
 
 
@@ -543,10 +541,9 @@ def repeated_records(window: Window, outputs: Mask) -> Mask:
     if not same.any():
         return np.zeros(window.records, dtype=np.bool_)
     images = np.logical_not(window.missing[:, outputs].any(axis=1))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     repeated = np.zeros(window.records, dtype=np.bool_)
     elsewhere = np.ones(len(changes), dtype=np.bool_)
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
+    for first, last in runs_of(same):
         run = first + np.flatnonzero(images[first : last + 1])
         if len(run) > MIN_REPEATED_RUN:
             repeated[run[1:-1] if len(run) < images.sum() else np.delete(run, len(run) // 2)] = True
