@@ -80,6 +80,7 @@ class HallFigures:
     machines: int
     seconds: float  # Measured
     cores: float  # Processor time of all processes, per second
+    cores_of_each: tuple[float, ...]  # First the process that acquires, as for memory
     pss_mb: float
     pss_of_each_mb: tuple[float, ...]  # First the process that acquires
     threads: int  # Of the process that acquires
@@ -160,10 +161,10 @@ def _measured(
 ) -> HallFigures:
     root = psutil.Process(daemon.pid)
     tree, before = [root, *root.children(recursive=True)], _disk(state)
-    spent, begun, first = sum(sum(each.cpu_times()[:2]) for each in tree), time.monotonic(), received.qsize()
+    spent, begun, first = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic(), received.qsize()
     time.sleep(seconds)
     elapsed = time.monotonic() - begun
-    cores = (sum(sum(each.cpu_times()[:2]) for each in tree) - spent) / elapsed
+    cores = tuple((sum(each.cpu_times()[:2]) - one) / elapsed for each, one in zip(tree, spent, strict=True))
     memory = [pss(each) for each in tree]
     documents = [ReportDocument.from_json(received.get()) for _ in range(received.qsize())]
     earlier = {document.machine: document.counters for document in documents[:first]}
@@ -179,7 +180,8 @@ def _measured(
     return HallFigures(
         machines=machines,
         seconds=elapsed,
-        cores=cores,
+        cores=sum(cores),
+        cores_of_each=cores,
         pss_mb=sum(memory),
         pss_of_each_mb=tuple(memory),
         threads=root.num_threads(),

@@ -291,14 +291,15 @@ import sys
 from pathlib import Path
 from otolith.machine import load_machine
 from otolith.publishing import recorder
+from otolith.storage.recording_files import Opened
 from otolith_drivers.base import Sampling
 
-class Ended:
-    def recv(self):
-        return None
+class Messages(list):
+    recv = list.pop
 
 machine = load_machine(Path(sys.argv[1]), with_driver=False)
-recorder.main(Ended(), Path(sys.argv[2]), machine.recorded(Sampling.TRUE))
+opened = Opened(Path(sys.argv[2]), machine.recorded(Sampling.TRUE), None)
+recorder.main(Messages([None, ("here.motor", 1, opened)]))
 print(sys.modules.get("pandas"))
 """
 

@@ -1,7 +1,7 @@
 """The Modbus driver: polls registers on the window's grid and reconnects after every fault.
 
-It can only read (see :mod:`otolith_drivers.modbus.client`). The time of a sample is the middle of its request's round
-trip.
+It can only read (see :mod:`otolith_drivers.modbus.client`), and shares its line with other drivers. The time of a
+sample is the middle of its request's round trip.
 """
 
 import logging
@@ -17,11 +17,11 @@ from otolith_drivers.modbus.client import (
     ConnectionLostError,
     ExceptionReplyError,
     NoReplyError,
-    ReadOnlyClient,
 )
 from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
 from otolith_drivers.modbus.schedule import MAX_FAILURES, PollSchedule, Request, RequestSet, plan, summary
+from otolith_drivers.modbus.shared_line import LineUser
 
 __all__ = ["ModbusPoller", "Options", "Source", "build"]
 
@@ -49,7 +49,7 @@ class ModbusPoller(ThreadedDriver):
         super().__init__()
         self._options = options
         self._signals = signals
-        self._client = ReadOnlyClient(options)
+        self._client = LineUser(options)
         hidden = {signal.decimals.place: signal.decimals for signal in signals if signal.decimals is not None}
         self._requests = RequestSet(plan([*signals, *hidden.values()], options.max_gap, options.max_registers))
         self._decimals: dict[tuple[int, str, int], float] = {}  # latest ones, by the place of their register
@@ -150,7 +150,6 @@ class ModbusPoller(ThreadedDriver):
             except ConnectionLostError:
                 self._end_reading(answered, deliver)
                 raise
-            self._stop.wait(self._options.pause)
             if busy and not waiting:
                 self._stop.wait(self._schedule.period / BUSY_PAUSES)
                 waiting, busy = deque(busy), []
@@ -159,10 +158,8 @@ class ModbusPoller(ThreadedDriver):
             self._connection.come_up("answers")
         if answered == len(self._signals):
             self._end_complete_round(time.monotonic() - begun, repeated=repeated)
-        if not usable:
-            self._client.drain()
-            if self._requests.all_silent:
-                self._go_down("no device answers")
+        if not usable and self._requests.all_silent:
+            self._go_down("no device answers")
         return usable
 
     def _refused(self, request: Request, error: ExceptionReplyError) -> list[Request]:
@@ -178,9 +175,11 @@ class ModbusPoller(ThreadedDriver):
 
     def _request(self, request: Request) -> tuple[list[int], float]:
         """Return registers and middle (s) of the round trip; reopen a closed line once; raises as ``read``."""
-        sent = time.monotonic()
         try:
-            registers = self._client.read(request.device, request.table, request.address, request.count)
+            with self._client.turn():
+                sent = time.monotonic()
+                registers = self._client.read(request.device, request.table, request.address, request.count)
+                received = time.monotonic()
         except ExceptionReplyError:
             self._answers += 1
             raise
@@ -189,7 +188,6 @@ class ModbusPoller(ThreadedDriver):
                 raise
             self._reopen()
             return self._request(request)  # not a third time, as the new connection has no answer yet
-        received = time.monotonic()
         self._answers += 1
         if self._answers > 1:
             self._closings = 0
