@@ -356,6 +356,8 @@ def test_nothing_of_it_runs_before_it_is_tried(tmp_path: Path) -> None:
     assert mark.read_text(encoding="ascii") == "x"  # in a process that has ended
     assert machine.try_fmu() is not None
     assert mark.read_text(encoding="ascii") == "x"  # what has passed is not tried again
+    assert machine.twin.fmu is not None
+    assert machine.twin.fmu.digest not in Path("/proc/self/maps").read_text(encoding="utf-8")
 
 
 def test_a_file_that_was_changed_after_it_was_read_is_refused(tmp_path: Path) -> None:
