@@ -90,8 +90,6 @@ class HallFigures:
     reports: int
     windows_missed: int
     samples_lost: int
-    history_kb_per_machine_hour: float
-    recording_kb_per_machine_hour: float
 
 
 def write_records(folder: Path, seconds: float) -> None:
@@ -140,7 +138,7 @@ def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, 
             with Subscriber(Connection((endpoint,)), received.put):
                 _wait_for_all(received, machines, daemon)
                 time.sleep(SETTLING)
-                return _measured(daemon, received, machines, seconds, state)
+                return _measured(daemon, received, machines, seconds)
         finally:
             daemon.send_signal(signal.SIGTERM)
             daemon.wait(timeout=60)
@@ -157,10 +155,10 @@ def _wait_for_all(received: "queue.SimpleQueue[str]", machines: int, daemon: "su
 
 
 def _measured(
-    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float, state: Path
+    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float
 ) -> HallFigures:
     root = psutil.Process(daemon.pid)
-    tree, before = [root, *root.children(recursive=True)], _disk(state)
+    tree = [root, *root.children(recursive=True)]
     spent, begun, first = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic(), received.qsize()
     time.sleep(seconds)
     elapsed = time.monotonic() - begun
@@ -171,7 +169,6 @@ def _measured(
     documents = documents[first:]
     latencies = np.array([document.cost.latency_s for document in documents], dtype=np.float64) * 1e3
     last = {document.machine: document.counters for document in documents}
-    per_hour, after = 3600.0 / elapsed / machines / 1e3, _disk(state)
 
     def rise(of: Callable[[CountersDocument], int]) -> int:
         before = sum(of(each) for each in earlier.values() if each is not None)
@@ -191,16 +188,7 @@ def _measured(
         reports=len(documents),
         windows_missed=rise(lambda counters: counters.windows_missed),
         samples_lost=rise(lambda counters: counters.lost),
-        history_kb_per_machine_hour=(after[0] - before[0]) * per_hour,
-        recording_kb_per_machine_hour=(after[1] - before[1]) * per_hour,
     )
-
-
-def _disk(state: Path) -> tuple[int, int]:
-    """Return the bytes of histories and of recordings."""
-    folders = [(state / "otolith" / name).glob("*") for name in ("history", "recordings")]
-    history, recordings = (sum(path.stat().st_size for path in files if path.is_file()) for files in folders)
-    return history, recordings
 
 
 def exponents(figures: Sequence[HallFigures]) -> dict[str, float]:

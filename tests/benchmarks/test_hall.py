@@ -1,0 +1,30 @@
+"""The benchmark of a hall runs, and its exponents are those of the figures."""
+
+import json
+
+import pytest
+from benchmarks.hall import HallFigures, exponents, main
+from click.testing import CliRunner
+
+
+def figures(machines: int) -> HallFigures:
+    return HallFigures(
+        machines=machines, seconds=30.0, cores=0.01 * machines, cores_of_each=(), pss_mb=3.0 * machines**0.5,
+        pss_of_each_mb=(), threads=1, latency_median_ms=20.0, latency_99_ms=50.0, latency_max_ms=90.0, reports=10,
+        windows_missed=0, samples_lost=0,
+    )  # fmt: skip
+
+
+def test_exponents_say_how_costs_grow_with_machines() -> None:
+    assert exponents([figures(20), figures(50), figures(100)]) == pytest.approx({"cores": 1.0, "pss_mb": 0.5})
+    assert exponents([figures(20)]) == {}
+
+
+@pytest.mark.full
+def test_a_hall_of_two_is_measured() -> None:
+    done = CliRunner().invoke(main, ["--machines", "2", "--seconds", "5", "--json"], catch_exceptions=False)
+    (hall,) = json.loads(done.stdout)["halls"]
+    assert hall["machines"] == 2
+    assert hall["reports"] >= 2
+    assert hall["samples_lost"] == 0
+    assert sum(hall["pss_of_each_mb"]) == pytest.approx(hall["pss_mb"])
