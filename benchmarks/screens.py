@@ -23,6 +23,7 @@ import click
 from click.testing import CliRunner
 from rich.console import Console, RenderableType
 
+from benchmarks import site_pictures
 from benchmarks.browser import Browser, browser, program
 from benchmarks.motor import CONFIG, RECORDS, windows
 from benchmarks.pictures import reduced, write_situations
@@ -254,6 +255,8 @@ def main() -> None:
         }
         (DOCS / "screens.md").write_text(document_of(texts), encoding="utf-8")
         write_situations(pictures, tab)
+        for key, content in site_pictures.pictures(tab, folder):
+            (pictures / f"{key}.png").write_bytes(content)
 
 
 if __name__ == "__main__":
