@@ -12,7 +12,7 @@ import pytest
 
 from otolith.health.limits import Level
 from otolith.machine_file import ZenohTable
-from otolith.publishing.publisher import Publisher
+from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access
 from tests.publishing.test_catch_up import ROUTER
 from tests.sites.machines import own_endpoint, report_of
@@ -41,7 +41,7 @@ class Plant:
             stack.enter_context(router(self.endpoint))
         elif part == "daemon":
             access = Access(ZenohTable(listen=(), connect=(self.endpoint,)))
-            self.publisher = Publisher(SITE, MACHINE, [], access)
+            self.publisher = Publisher([Published(SITE, MACHINE, None)], [], access)
             stack.callback(self.publisher.close)
         else:
             self.served = stack.enter_context(serving(self.folder, self.endpoint))
