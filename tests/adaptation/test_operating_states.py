@@ -7,6 +7,7 @@ import pytest
 from benchmarks.diagnosis import machine_of
 from benchmarks.everyday import (
     NOISE,
+    ONSET,
     PERIOD,
     RECORDS,
     RESISTANCE,
@@ -90,3 +91,13 @@ def test_nothing_is_used_of_a_window_with_short_parts() -> None:
     assert part is not None
     assert part.window is None
     assert "1.2 s" in part.note
+
+
+def test_an_offset_is_not_severe_because_the_machine_stands_still() -> None:
+    """Its share of the signal is that while the machine runs: at rest any offset is all of the current."""
+    stops = Machine(
+        speed=lambda time: 12.0 if time < 60.0 else 0.0, current_zero=lambda time: 0.02 if time > ONSET else 0.0
+    )
+    outcome = run_of(Situation("offset", stops, ("sensor",)), 1)
+    assert outcome.verdict == "right", outcome.story
+    assert not any(" ACT " in line for line in outcome.story), outcome.story

@@ -6,6 +6,7 @@ Time arrives with the window and randomness with the seed. Every run is therefor
 can move between processes. ``docs/explanation/evidence.md`` has the quantities that are compared.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
     Ledger,
+    larger_sizes,
     with_converter_steps,
     with_posterior,
     with_records,
@@ -93,7 +95,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
         result, ledger = _search_together(scores.state, scores.tested, result, scores.ledger)
         result, ledger = _find_input_noise(scores.state, scores.tested, result, ledger)
     faulty = checked.faulty_sensors
-    result = replace(result, faulty_sensors=faulty, notes=(*shortened, *checked.notes, *(own.text for own in faulty)))
+    notes = (*shortened, *checked.notes, *(own.text for own in faulty))
+    result = replace(result, faulty_sensors=faulty, notes=notes, sizes=state.sizes)
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, used, result)
@@ -529,7 +532,15 @@ def _next_state(
         previous=previous,
         health=health,
         records=_next_records(state, result),
+        sizes=_next_sizes(state, result),
     )
+
+
+def _next_sizes(state: AdaptationState, result: WindowResult) -> Mapping[str, float]:
+    """Return the sizes of signals; windows that do not update the posterior may be of wrong data."""
+    if result.estimate is None or not result.is_accepted:
+        return state.sizes
+    return larger_sizes(state.sizes, result.estimate.fit.window)
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:

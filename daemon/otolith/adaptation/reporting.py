@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.state import AdaptationState, larger_sizes
 from otolith.discovery.alternatives import (
     ACCEPTED,
     ALTERNATIVES,
@@ -107,6 +107,7 @@ class WindowResult:
     notes: tuple[str, ...] = ()  # What the data checks left out
     is_mixture: bool = False  # Whether after is the mixture of the hypotheses of an open test
     searched: bool = False  # Whether other hypotheses were compared
+    sizes: Mapping[str, float] = field(default_factory=dict)  # AdaptationState.sizes before the window
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result
@@ -479,7 +480,7 @@ def _open_finding(test: SequentialTest, result: WindowResult, experiment: str) -
         condition=_what_is_new(test) if kind is FindingKind.OPEN else condition,
         text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
-        error=_error(fault, result.estimate),
+        error=_error(fault, result),
         advice=experiment,
         setting=describe_setting(fault or test.best) or _corrected_value(test),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
@@ -518,10 +519,10 @@ def _kind_and_subject(
     return (FindingKind.MOVED, moved) if (moved := _moved_known(test)) else (FindingKind.OPEN, "")
 
 
-def _error(fault: TrackedHypothesis | None, estimated: WindowEstimate | None) -> float | None:
-    """Return the delay of a late signal, s, or the error of a sensor over the size of its signal in the window.
+def _error(fault: TrackedHypothesis | None, result: WindowResult) -> float | None:
+    """Return the delay of a late signal, s, or the error of a sensor over the size of its signal.
 
-    That of an offset is its share of the root mean square of the signal; None of what is neither, and without a size.
+    That of an offset is its share of the largest root mean square of the signal in a window; None without a size.
     """
     if fault is None or not (fault.problem.components or fault.problem.delays):
         return None
@@ -532,9 +533,9 @@ def _error(fault: TrackedHypothesis | None, estimated: WindowEstimate | None) ->
     site = site_of(fault.problem.base_model, component.site)
     if component.family == "linear" or site.mode == "multiplicative":
         return float(amplitude)
-    if estimated is None or site.into not in (window := estimated.fit.window).signals:
-        return None
-    size = float(np.sqrt(np.nanmean(np.square(window.measured((site.into,))))))
+    size = result.sizes.get(site.into, 0.0)
+    if result.estimate is not None:
+        size = larger_sizes(result.sizes, result.estimate.fit.window).get(site.into, 0.0)
     return float(amplitude) / size if size > 0.0 else None
 
 
