@@ -214,3 +214,10 @@ def runs_of(mask: Mask) -> list[tuple[int, int]]:
     """Return begin and end of each run of true records."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def larger_sizes(sizes: Mapping[str, float], window: Window) -> dict[str, float]:
+    """Return the largest root mean square of each signal, also in ``window``."""
+    columns = ((name, window.column(name)[~window.missing_in(name)]) for name in window.signals)
+    own = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in columns if len(values)}
+    return {name: max(own.get(name, 0.0), sizes.get(name, 0.0)) for name in {**sizes, **own}}

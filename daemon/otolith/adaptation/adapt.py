@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array, Window, larger_sizes
 from otolith.adaptation.frozen_sensors import frozen_readings, with_still_frozen
 from otolith.adaptation.operating_states import running_part
 from otolith.adaptation.reporting import OPEN, WindowResult, make_report
@@ -19,7 +19,6 @@ from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
     Ledger,
-    larger_sizes,
     with_converter_steps,
     with_posterior,
     with_records,

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState, larger_sizes
+from otolith.acquisition.window import Window, larger_sizes
+from otolith.adaptation.state import AdaptationState
 from otolith.discovery.alternatives import (
     ACCEPTED,
     ALTERNATIVES,

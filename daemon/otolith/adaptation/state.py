@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Window
 from otolith.adaptation.fingerprints import fingerprint_of
 from otolith.adaptation.frozen_sensors import FrozenReading
 from otolith.commissioning.input_noise import InputNoiseSums
@@ -82,13 +81,6 @@ class AdaptationState:
     def problem(self) -> Problem:
         """The estimation problem, with the components in the twin."""
         return self.posterior.problem
-
-
-def larger_sizes(sizes: Mapping[str, float], window: Window) -> dict[str, float]:
-    """Return the largest root mean square of each signal, also in ``window``."""
-    columns = ((name, window.column(name)[~window.missing_in(name)]) for name in window.signals)
-    own = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in columns if len(values)}
-    return {name: max(own.get(name, 0.0), sizes.get(name, 0.0)) for name in {**sizes, **own}}
 
 
 def initial_state(machine: str, site: str, problem: Problem, plan: MonitoringPlan | None = None) -> AdaptationState:
