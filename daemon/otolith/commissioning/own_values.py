@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Window
+from otolith.commissioning.constancy import ValueChange, value_changes
 from otolith.commissioning.identification import identify_noise, sample_noise, usable_windows
 from otolith.commissioning.likelihood import Progress
 from otolith.commissioning.structure import Structure, remaining_structure
@@ -68,6 +69,10 @@ def own_values(
         return OwnValues((), {}, np.inf, 0)
     record = _RecordSearch(problem, tuple(free), frozenset(loads), progress)
     best, punctual = record.punctual(chosen)
+    if best.is_followed and (changes := record.changes(best, sorted(usable, key=lambda window: window.start))):
+        best = replace(best, changes=changes)
+        if not all(change.is_drift for change in changes):
+            return best
     if best.is_followed and not best.is_explained:
         best = record.beside_components(best, punctual)
     if not best.is_explained and (signs := tuple(record.reversed_signals(best, punctual))):
@@ -187,6 +192,17 @@ class _RecordSearch:
         own = tuple(item for item in found.values if not item.name.startswith("_"))
         loads = {name: ends for name, ends in found.loads.items() if not name.startswith("_")}
         return replace(found, values=own, loads=loads, beside=tuple(item.component.key for item in shown))
+
+    def changes(self, found: OwnValues, windows: Sequence[Window]) -> tuple[ValueChange, ...]:
+        """Return which of the values differ between both ends of the record, as each window shows them alone."""
+        self.progress("whether the values are the same in all windows")
+        values = {item.name: item.value for item in found.values}
+        names = [item.name for item in found.values if item.sd is not None and not item.is_taken]
+        rows = tuple(_around(row, values) for row in self.free if row.name in names or row.name in self.loads)
+        taken = {row.name for row in rows}
+        known = {**dict(self.problem.known), **{row.name: row.nominal for row in self.problem.free}, **values}
+        held = tuple((name, value) for name, value in known.items() if name not in taken)
+        return value_changes(replace(self.problem, known=held, free=rows), windows, names)
 
     def _at(self, found: OwnValues) -> Problem:
         """Return the problem with the values that were found."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.commissioning.constancy import ValueChange
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, deviations, size_of
@@ -53,6 +54,7 @@ class OwnValues:
     misfits: tuple[float, ...] = ()  # (windows,) mean square of what the twin leaves without being corrected
     faults: tuple[str, ...] = ()  # Why no value may be written
     beside: tuple[str, ...] = ()  # Components that were fitted with the values
+    changes: tuple[ValueChange, ...] = ()  # Values that differ between both ends of the record
 
     @property
     def is_followed(self) -> bool:
