@@ -36,7 +36,6 @@ class ValueChange:
     after_sd: float
     since: float | None  # s, begin of the first window with the new value; None of a drift
     until: float | None  # s, end of the last window with the old value; None of a drift
-    windows: tuple[int, int]  # With the old value, and with the new one
 
     @property
     def is_drift(self) -> bool:
@@ -60,7 +59,6 @@ class _Explained:
     degrees: int  # Of freedom that are left
     values: Array  # (terms, values) in units of width
     covariance: Array  # (terms * values, terms * values)
-    places: tuple[Array, ...] = ()  # Of the terms
 
 
 def value_changes(problem: Problem, windows: Sequence[Window], names: Sequence[str]) -> tuple[ValueChange, ...]:
@@ -79,9 +77,7 @@ def value_changes(problem: Problem, windows: Sequence[Window], names: Sequence[s
     model, fitted = _best_model(rows, [window.start for window in windows])
     if model is None:
         return ()
-    scale = np.sqrt(max(fitted.chi_square / fitted.degrees, 1.0))
-    width = likelihood.width[own]
-    return tuple(_changes(model, fitted, scale, width, names, windows))
+    return tuple(_changes(model, fitted, likelihood.width[own], names, windows))
 
 
 def _whitened(fit: FittedWindow, width: Array, own: Sequence[int]) -> tuple[Array, Array]:
@@ -142,23 +138,22 @@ def _explained(rows: Sequence[tuple[Array, Array]], shape: Array) -> _Explained:
 
 
 def _changes(
-    model: _Model, fitted: _Explained, scale: float, width: Array, names: Sequence[str], windows: Sequence[Window]
+    model: _Model, fitted: _Explained, width: Array, names: Sequence[str], windows: Sequence[Window]
 ) -> Iterator[ValueChange]:
     """Yield the parameters whose change is beyond its interval and LEAST_CHANGE."""
     count, at = len(names), model.place
-    variance = scale**2 * fitted.covariance
+    variance = max(fitted.chi_square / fitted.degrees, 1.0) * fitted.covariance
     for place, name in enumerate(names):
-        one, two = place, count + place
-        before, change = fitted.values[0, place], fitted.values[1, place]
-        sds = np.sqrt([variance[one, one], variance[two, two], variance[[one, two]][:, [one, two]].sum()])
-        before_sd, change_sd, after_sd = (sds * width[place]).tolist()
-        before, change = float(before * width[place]), float(change * width[place])
+        ends = [place, count + place]
+        before, change = (float(value) for value in fitted.values[:2, place] * width[place])
+        own = variance[np.ix_(ends, ends)]
+        before_sd, change_sd, after_sd = (np.sqrt([own[0, 0], own[1, 1], own.sum()]) * width[place]).tolist()
         least = LEAST_CHANGE * min(abs(before), abs(before + change))
         if abs(change) <= max(QUANTILE * change_sd, least):
             continue
         if at is None:
-            sides = (len(windows), 0)
-            yield ValueChange(name, before, before_sd, before + change, after_sd, None, None, sides)
-            continue
-        since, last = windows[at].start, windows[at - 1]
-        yield ValueChange(name, before, before_sd, before + change, after_sd, since, last.end, (at, len(windows) - at))
+            yield ValueChange(name, before, before_sd, before + change, after_sd, None, None)
+        else:
+            yield ValueChange(
+                name, before, before_sd, before + change, after_sd, windows[at + 1].start, windows[at - 1].end
+            )

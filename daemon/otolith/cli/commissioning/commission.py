@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
     from otolith.cli.commissioning.machine_lines import NewLine
     from otolith.cli.commissioning.noise import HealthyData
+    from otolith.commissioning.constancy import ValueChange
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise
     from otolith.commissioning.value_search import OwnValues
@@ -141,6 +142,8 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
         found = own_values(machine.problem, chosen, free, loads, show)
     if found.faults or not found.is_followed:
         raise ConfigurationError(f"{data.path}: no value is written: {_refusal(machine, found)}")
+    if steps := [change for change in found.changes if not change.is_drift]:
+        raise ConfigurationError(f"{data.path}: no value is written: {_of_two_states(machine, steps)}")
     if found.beside:
         echo(f"the log shows {', '.join(found.beside)}, which the twin lacks: fitted with the values", err=True)
     lines, remarks = _value_lines(machine, found, data.path)
@@ -168,6 +171,25 @@ def _refusal(machine: "LoadedMachine", found: "OwnValues") -> str:
     return f"{why}: {check}; 'otolith twin list' shows other twins"
 
 
+def _of_two_states(machine: "LoadedMachine", steps: "Sequence[ValueChange]") -> str:
+    """Return which values step within the record, when, and which part of it to take."""
+    from otolith.acquisition.quality import time_text
+    from otolith.estimation.information import QUANTILE
+    from otolith.health.text import quantity_text
+    from otolith.health.times import in_local_time
+
+    def told(change: "ValueChange") -> str:
+        unit = machine.twin.parameter(change.name).unit
+        before = quantity_text(change.before, unit, QUANTILE * change.before_sd)
+        after = quantity_text(change.after, unit, QUANTILE * change.after_sd)
+        return f"{change.name} is {before} until {time_text(change.until or 0.0)} and {after} from {since} on"
+
+    since, until = time_text(steps[0].since or 0.0), time_text(steps[0].until or 0.0)
+    remedy = f"give a file that ends before {until}, or one that begins after {since}"
+    text = f"{'; '.join(map(told, steps))}: the record is of two states of the machine: {remedy}"
+    return in_local_time(text, machine.plan.timezone)
+
+
 def _stated(machine: "LoadedMachine") -> set[str]:
     """Return the parameters whose values the file states."""
     return {name for name, table in machine.file.parameters.items() if table.value is not None}
@@ -189,7 +211,9 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
         origin = item.remark or f"from {data.name}"
         remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, {origin}"
         source = item.remark if item.is_taken else row.meaning
-        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({source})")
+        drift = next((change for change in found.changes if change.name == item.name and change.is_drift), None)
+        moves = f"; it moves from {drift.before:.4g} to {drift.after:.4g} {row.unit} in the record" if drift else ""
+        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({source}){moves}")
         value = written_value(machine, row, item.value, _bounds(row, item.value))
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
