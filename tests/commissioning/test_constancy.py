@@ -20,7 +20,7 @@ def changes(motor: MotorScenario, windows: Cut, resistances: tuple[float, ...], 
     """Return the changes in a record of which each window is of a machine with its own resistance."""
     record = list[Window]()
     for place, resistance in enumerate(resistances):
-        own = motor.model_copy(update={"seed": seed, "parameters": motor.parameters | {"R_a": resistance}})
+        own = motor.model_copy(update={"seed": seed, "parameters": motor.parameters.model_copy(update={"R_a": resistance})})
         record.append(windows(own, len(resistances))[place][0])
     return found(find_twin("dc_motor"), record, set()).changes
 
