@@ -90,6 +90,10 @@ class SharedFit:
             guesses.append(own)
         return guesses
 
+    def cost(self, result: FitResult) -> float:
+        """Return the root mean square of a fit's residuals; a record without a measurement has none."""
+        return float(np.sqrt(result.chi_square / max(sum(float(each.count) for each in self._objectives), 1.0)))
+
     def linearise(self, guess: Array) -> tuple[Array, Array]:
         """See :class:`otolith.estimation.minimisers.LeastSquares`."""
         count, residuals, rows, delays = len(self.scales), list[Array](), list[Array](), self.delays(guess)

@@ -24,6 +24,7 @@ STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would b
 STAGE_STEPS, LAST_STEPS = 12, 40  # of Gauss-Newton
 QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
 MAX_QUIET_COST = 1.5  # RMSE of that fit over the noise, up to which the twin hardly lacks anything
+DIFFERENT = 4.0  # standard deviations between the values of both fits, beyond which noise does not explain it
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
 MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
 PHASES = 8  # of a sine that are tried in each window
@@ -127,10 +128,13 @@ class ValueSearch:
         others, quiet_cost = self._quieter(fitted.stage)
         spread = {name: float(np.hypot(sd[name], others[name] - value)) for name, value in values.items()}
         shares, misfits = self._simulated(fitted.stage)
-        found = OwnValues(
-            self._values(values, spread), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits
-        )
-        return replace(found, faults=tuple(self._contradictions(values, others, spread)))
+        found = OwnValues((), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits)
+        wide = [name for name in values if QUANTILE * spread[name] > DETERMINED * self._size(name, values[name])]
+        differ = [name for name in values if abs(others[name] - values[name]) > DIFFERENT * sd[name]]
+        if wide and found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
+            return replace(found, values=self._values(others, spread))
+        faults = tuple(self._contradictions([name for name in wide if name[0] != "_"], values, others))
+        return replace(found, values=self._values(values, spread), faults=faults)
 
     def _quieter(self, stage: _Stage) -> tuple[dict[str, float], float]:
         """Return the values of a fit that trusts the twin more, and its cost.
@@ -139,8 +143,8 @@ class ValueSearch:
         """
         noise = tuple(QUIETER * level for level in stage.problem.process_noise)
         quieter = replace(stage, problem=replace(stage.problem, process_noise=noise))
-        guesses, result, _ = self._fit(quieter, LAST_STEPS)
-        return {name: float(guesses[0][ats[0]]) for name, ats in stage.shared.items()}, _cost(result)
+        guesses, result, together = self._fit(quieter, LAST_STEPS)
+        return {name: float(guesses[0][ats[0]]) for name, ats in stage.shared.items()}, together.cost(result)
 
     def _simulated(self, stage: _Stage) -> tuple[dict[str, float], tuple[float, ...]]:
         """Return the explained share of the variance of each output that moves, and the mean square left by window.
@@ -167,13 +171,12 @@ class ValueSearch:
         return shares, tuple(misfits)
 
     def _contradictions(
-        self, values: Mapping[str, float], others: Mapping[str, float], spread: Mapping[str, float]
+        self, names: Sequence[str], values: Mapping[str, float], others: Mapping[str, float]
     ) -> Iterator[str]:
-        """Yield the values that depend on how far the measurements correct the twin."""
-        for name, value in values.items():
-            if not name.startswith("_") and QUANTILE * spread[name] > DETERMINED * self._size(name, value):
-                unit = self._problem.free[self._places[name]].unit
-                yield f"{name} is {value:.3g} {unit}, but {others[name]:.3g} {unit} where measurements correct less"
+        """Yield how the values ``names`` depend on how far the measurements correct the twin."""
+        for name in names:
+            unit = self._problem.free[self._places[name]].unit
+            yield f"{name} is {values[name]:.3g} {unit}, but {others[name]:.3g} {unit} where measurements correct less"
 
     def delays(self) -> Array:
         """Return by how much the signals are late (s) where that shows beside the values; zeros where it does not."""
@@ -185,7 +188,7 @@ class ValueSearch:
         largest = min(largest_delay(window.grid.length, window.sample_period) for window in self._windows)
         _, result, together = self._fit(stage, LAST_STEPS, largest)
         late = together.delays(result.guess)
-        is_shown = np.abs(late).max() < largest and self.gain(cost, _cost(result)) > DECISIVE
+        is_shown = np.abs(late).max() < largest and self.gain(cost, together.cost(result)) > DECISIVE
         return late - np.median(late) if is_shown else none
 
     def gain(self, before: float, after: float) -> float:
@@ -244,7 +247,7 @@ class ValueSearch:
         ))  # fmt: skip
         there = with_initial_noise(there, self._windows)
         guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), LAST_STEPS)
-        cost = _cost(result)
+        cost = together.cost(result)
         values = {name: float(guesses[0][ats[0]]) for name, ats in moved.items()}
         sizes = {name: self._size(name, value) for name, value in values.items()}
         sd, weakest = deviations(result, together, sizes, cost)
@@ -319,10 +322,6 @@ class ValueSearch:
             else:
                 rows.append(OwnValue(name, values[name], sd[name]))
         return tuple(rows)
-
-
-def _cost(result: FitResult) -> float:
-    return float(np.sqrt(result.chi_square / max(len(result.residuals), 1)))
 
 
 def are_one_constant(one: Parameter, other: Parameter) -> bool:

@@ -42,16 +42,16 @@ from otolith_drivers.number_inference import (
 )
 
 # Engineering choices, guarded by tests/drivers/modbus/test_probe.py.
-MAX_TIMES = 1000  # round trips kept of each length of request
+MAX_TIMES = 1000  # round trips kept of each length of request, and changes of each register
 MAX_BUSY_REPEATS, BUSY_PAUSE = 5, 0.1  # repeats of a request to a busy device; s between them
 CHUNK = MAX_REGISTERS - 1  # registers of a request: an even number, so that 32-bit numbers are read whole
-MAX_READINGS = 1000  # kept of each register
+MAX_READINGS = 1000  # kept of each register, evenly over the time
 MIN_PERIOD = 0.01  # s from round to round: fast enough to see noise, without loading the device fully
 RATES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1)  # usual rates in Hz
 MAX_LOAD = 0.9  # share of a period that requests may take at a possible rate
 MAX_SPANS = 8  # ranges of registers that are listed
 Words = NDArray[np.uint16]  # Readings by registers
-Times = NDArray[np.float64]  # s, of the same readings
+Changes = list[deque[float]]  # Times in s of the latest changes of each register of a block
 Stopped = Callable[[], bool]  # Whether the user has ended the probe
 ProgressCallback = Callable[[str], None]  # Takes a line about what is being done
 # A device that has one byte order for some numbers seldom has another for others. Engineering choices, guarded by
@@ -298,24 +298,39 @@ def spans(addresses: Iterable[int], noun: str = "register") -> str:
 
 def watch(
     client: ProbeClient, blocks: Sequence[Block], seconds: float, stopped: Stopped, progress: ProgressCallback
-) -> tuple[dict[Block, Words], dict[Block, Times]]:
-    """Read all blocks repeatedly for ``seconds``, at least once; return readings (rounds by registers) and times."""
+) -> tuple[dict[Block, Words], dict[Block, Changes]]:
+    """Read all blocks repeatedly for ``seconds``, at least once; return readings (rounds by registers) and changes.
+
+    Of a long time only some of the readings are kept, but a change is seen in all of them.
+    """
     readings: dict[Block, list[list[int]]] = {block: [] for block in blocks}
-    times: dict[Block, list[float]] = {block: [] for block in blocks}
-    period = max(MIN_PERIOD, seconds / MAX_READINGS)
+    changes: dict[Block, Changes] = {block: [deque(maxlen=MAX_TIMES) for _ in block.addresses] for block in blocks}
+    latest: dict[Block, list[int]] = {}
     begun = time.monotonic()
-    round_due = begun
+    round_due = kept_due = begun
     while blocks and (round_due == begun or (time.monotonic() - begun < seconds and not stopped())):
         progress(f"reading for {max(0.0, seconds - time.monotonic() + begun):.0f} s more")
+        is_kept = time.monotonic() >= kept_due
+        kept_due += is_kept * seconds / MAX_READINGS
         for block in blocks:
             with contextlib.suppress(ExceptionReplyError, NoReplyError):  # the survey has read it before
-                readings[block].append(client.read(block.address, block.count))
-                times[block].append(time.monotonic())
+                words = client.read(block.address, block.count)
+                _note_changes(changes[block], latest.get(block, words), words, time.monotonic())
+                latest[block] = words
+                if is_kept:
+                    readings[block].append(words)
         now = time.monotonic()
-        round_due = max(round_due + period, now)
+        round_due = max(round_due + MIN_PERIOD, now)
         time.sleep(max(0.0, min(round_due, begun + seconds) - now))
-    words = {block: np.array(rows, dtype=np.uint16).reshape(-1, block.count) for block, rows in readings.items()}
-    return words, {block: np.array(rows) for block, rows in times.items()}
+    words_of = {block: np.array(rows, dtype=np.uint16).reshape(-1, block.count) for block, rows in readings.items()}
+    return words_of, changes
+
+
+def _note_changes(changes: Changes, before: Sequence[int], now: Sequence[int], moment: float) -> None:
+    """Add ``moment`` (s) to the registers that differ from ``before``."""
+    for own, old, new in zip(changes, before, now, strict=True):
+        if old != new:
+            own.append(moment)
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,13 +408,13 @@ def numbers_of(readings: Mapping[Block, Words]) -> list[Number]:
     ])  # fmt: skip
 
 
-def renewal_of(number: Number, readings: Mapping[Block, Words], times: Mapping[Block, Times]) -> float | None:
+def renewal_of(number: Number, changes: Mapping[Block, Changes]) -> float | None:
     """Return the time in s between two renewals of a number while it moves; None if it has changed too seldom."""
-    block = next(block for block in readings if number.address in block.addresses)
+    block = next(block for block in changes if number.address in block.addresses)
     first = number.address - block.address
-    own = readings[block][:, first : first + number.count]
-    renewed = times[block][1:][(own[1:] != own[:-1]).any(axis=1)]
-    return renewal_period(np.diff(renewed).tolist())
+    own = changes[block][first : first + number.count]
+    known = max((times[0] for times in own if len(times) == MAX_TIMES), default=-math.inf)  # since then from all
+    return renewal_period(np.diff(sorted({moment for times in own for moment in times if moment >= known})).tolist())
 
 
 def bytes_of(words: Words) -> Bytes:

@@ -1,6 +1,7 @@
 """The survey, scan and timing of the probe, against devices that refuse, are busy or silent."""
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,8 +15,10 @@ from otolith_drivers.modbus.probe import (
     Block,
     ProbeClient,
     Speed,
+    numbers_of,
     open_line,
     possible_rate,
+    renewal_of,
     scan,
     spans,
     speeds,
@@ -119,9 +122,8 @@ def test_watch_reads_repeatedly_and_times_requests() -> None:
     with connected(Behaviour({3: 77})) as client:
         result = survey(client, 0, 9, never, quiet)
         client.round_trips.clear()
-        readings, times = watch(client, result.blocks, 0.3, never, quiet)
-        assert (np.diff(times[Block(0, 10)]) > 0.0).all()
-        assert len(times[Block(0, 10)]) == len(readings[Block(0, 10)])
+        readings, changes = watch(client, result.blocks, 0.3, never, quiet)
+        assert not any(changes[Block(0, 10)]), "nothing has changed"
         assert [block for block, _ in readings.items()] == [Block(0, 10)]
         words = readings[Block(0, 10)]
         assert words.shape[0] >= 5
@@ -129,6 +131,21 @@ def test_watch_reads_repeatedly_and_times_requests() -> None:
         (speed,) = speeds(client, result.blocks)
     assert 0.0 < speed.median <= speed.slow < 0.3
     assert "10 registers in one request" in speed.describe()
+
+
+def test_the_renewal_of_a_register_does_not_depend_on_how_long_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a long time few readings are kept: here every half second, of a number that is renewed each 0.1 s."""
+    monkeypatch.setattr("otolith_drivers.modbus.probe.MAX_READINGS", 5)
+    begun, words = time.monotonic(), {0: 0, 1: 0}
+
+    def renewed(*_: int) -> None:
+        words[1] = int(10.0 * (time.monotonic() - begun)) ** 2
+
+    with connected(Behaviour(words, refuse=renewed)) as client:
+        readings, changes = watch(client, [Block(0, 2)], 2.5, never, quiet)
+    assert 2 <= len(readings[Block(0, 2)]) <= 6
+    (number,) = (number for number in numbers_of(readings) if number.address + number.count > 1)
+    assert renewal_of(number, changes) == pytest.approx(0.1)
 
 
 def test_watch_reads_at_least_one_round() -> None:

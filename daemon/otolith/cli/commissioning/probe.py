@@ -200,11 +200,11 @@ def read_registers(place: "Place", addresses: Span, seconds: float, stop: StopSi
         surveyed = survey(client, first, last, stop.received, show)
         client.round_trips.clear()  # the first requests take longer
         begun = time.monotonic()
-        readings, times = watch(client, surveyed.blocks, seconds, stop.received, show)
+        readings, changes = watch(client, surveyed.blocks, seconds, stop.received, show)
         elapsed = time.monotonic() - begun
         show("comparing")
         requests = speeds(client, surveyed.blocks)
-        return DeviceProbe(place, addresses, surveyed, readings, times, requests, elapsed, numbers_of(readings))
+        return DeviceProbe(place, addresses, surveyed, readings, changes, requests, elapsed, numbers_of(readings))
 
 
 @probe.command("can")

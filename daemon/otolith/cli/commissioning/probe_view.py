@@ -90,7 +90,7 @@ class DeviceProbe:
     registers: tuple[int, int]  # Addresses (on the wire) of the first and the last register asked for
     survey: modbus.Survey
     readings: dict[modbus.Block, modbus.Words]
-    times: dict[modbus.Block, modbus.Times]
+    changes: dict[modbus.Block, modbus.Changes]
     speeds: list[modbus.Speed]
     seconds: float  # Time spent reading
     numbers: list[modbus.Number]

@@ -53,7 +53,7 @@ def device_offers(
 
     def interval(number: "Number") -> float | None:
         """Return the time in s from one new value to the next; without one, that of answers if it is long."""
-        renewal = renewal_of(number, probed.readings, probed.times)
+        renewal = renewal_of(number, probed.changes)
         return (fastest if fastest > USUAL_PERIOD else None) if renewal is None else max(renewal, fastest)
 
     offers = [
