@@ -16,6 +16,7 @@ from otolith.cli.commissioning.commission import Manner
 from otolith.cli.commissioning.noise import HealthyLog, UnusableData
 from otolith.cli.main import cli
 from otolith.commissioning import own_values
+from otolith.commissioning.constancy import ValueChange
 from otolith.commissioning.delays import IdentifiedDelays
 from otolith.commissioning.identification import AT_REST, CONSTANT, IdentifiedNoise, NoiseLevel
 from otolith.commissioning.value_search import OwnValue, OwnValues
@@ -273,6 +274,29 @@ def test_values_that_cannot_be_taken_end_it(
         otolith("commission", ran, *SPAN, "--windows", "4", "--write")
     assert ran.read_text(encoding="utf-8") == text
     assert store_of(load_machine(ran, with_driver=False)).decisions().baselines == {}
+
+
+@pytest.mark.parametrize("faults", [(), ("other sign of T_load",)], ids=["alone", "beside a wrong sign"])
+def test_a_record_of_two_states_of_the_machine_gives_no_values(
+    faults: tuple[str, ...], ran: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = with_limits(ran)
+    step = ValueChange("R_a", 6.5, 0.01, 7.4, 0.02, since=BEGIN + 34.0, until=BEGIN + 32.0)
+    values = OwnValues((OwnValue("R_a", 6.9, 0.01),), {}, 1.0, 12, {"omega": 1.0}, 1.0, faults=faults, changes=(step,))
+    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    with raises_saying(ConfigurationError, "R_a", "6.5", "7.4", "08:00:32", "08:00:34", *faults):
+        otolith("commission", ran, *SPAN, "--windows", "4", "--write")
+    assert ran.read_text(encoding="utf-8") == text
+
+
+def test_a_drift_is_written_and_told_at_both_ends(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with_limits(ran)
+    drift = ValueChange("R_a", 6.4, 0.01, 6.8, 0.02, None, None)
+    values = OwnValues((OwnValue("R_a", 6.6, 0.01),), {}, 1.0, 12, {"omega": 1.0}, 1.0, changes=(drift,))
+    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    result = otolith("commission", ran, *SPAN, "--windows", "4", "--write")
+    assert tables(ran)["parameters"]["R_a"]["value"] == "6.6 ohm"
+    assert_says(result.stderr, "R_a", "6.4", "6.8")
 
 
 def test_a_time_without_estimates_gives_no_baseline(ran: Path) -> None:

@@ -222,7 +222,7 @@ def polled(scenario: MotorScenario, seed: int) -> list[Window]:
     holds = {row.name: row.hold for row in twin.inputs}
     plans = [SignalPlan(name, hold=holds.get(name), sampling=Sampling.POLLED) for name in columns]
     playback = Playback(plans, 200, 0.02)
-    rows = Rows(times, columns, np.arange(1, 6001), np.zeros(6000, dtype=np.int64))
+    rows = Rows(np.asarray(times, dtype=np.float64), columns, np.arange(1, 6001), np.zeros(6000, dtype=np.int64))
     return [window for window in (*playback.windows(rows), *playback.rest()) if not window.quality.reasons]
 
 

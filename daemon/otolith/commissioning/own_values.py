@@ -69,12 +69,10 @@ def own_values(
         return OwnValues((), {}, np.inf, 0)
     record = _RecordSearch(problem, tuple(free), frozenset(loads), progress)
     best, punctual = record.punctual(chosen)
-    if best.is_followed and (changes := record.changes(best, sorted(usable, key=lambda window: window.start))):
-        best = replace(best, changes=changes)
-        if not all(change.is_drift for change in changes):
-            return best
+    changes = record.changes(best, sorted(usable, key=lambda window: window.start)) if best.is_followed else ()
     if best.is_followed and not best.is_explained:
         best = record.beside_components(best, punctual)
+    best = replace(best, changes=changes)
     if not best.is_explained and (signs := tuple(record.reversed_signals(best, punctual))):
         return replace(best, faults=signs)
     return replace(best, faults=(*best.faults, *_mixed_units(free, best)))

@@ -140,10 +140,11 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
     with progress_line("reading") as show:
         chosen = good_windows(machine, data, windows)
         found = own_values(machine.problem, chosen, free, loads, show)
-    if found.faults or not found.is_followed:
-        raise ConfigurationError(f"{data.path}: no value is written: {_refusal(machine, found)}")
+    reasons = [_refusal(machine, found)] if found.faults or not found.is_followed else []
     if steps := [change for change in found.changes if not change.is_drift]:
-        raise ConfigurationError(f"{data.path}: no value is written: {_of_two_states(machine, steps)}")
+        reasons.append(_of_two_states(machine, steps))
+    if reasons:
+        raise ConfigurationError(f"{data.path}: no value is written: {'; '.join(reasons)}")
     if found.beside:
         echo(f"the log shows {', '.join(found.beside)}, which the twin lacks: fitted with the values", err=True)
     lines, remarks = _value_lines(machine, found, data.path)
@@ -175,8 +176,8 @@ def _of_two_states(machine: "LoadedMachine", steps: "Sequence[ValueChange]") -> 
     """Return which values step within the record, when, and which part of it to take."""
     from otolith.acquisition.quality import time_text
     from otolith.estimation.information import QUANTILE
-    from otolith.health.text import quantity_text
     from otolith.health.times import in_local_time
+    from otolith_drivers.units import quantity_text
 
     def told(change: "ValueChange") -> str:
         unit = machine.twin.parameter(change.name).unit
