@@ -329,14 +329,14 @@ def test_a_binary_that_cannot_be_used_is_refused(case: str, tmp_path: Path, monk
 
 def _failing(text: str) -> str:
     return text.replace(
-        "return copy(component, values, count, FIRST_RATE, STATES);",
-        "if (((Instance *)component)->memory.variables[FIRST_STATE] > 1e6) { return fmi2Error; }\n"
-        "    return copy(component, values, count, FIRST_RATE, STATES);",
+        "return copy(own, values, count, FIRST_RATE, STATES);",
+        "if (((Instance *)own)->memory.variables[FIRST_STATE] > 1e6) { return fmi2Error; }\n"
+        "    return copy(own, values, count, FIRST_RATE, STATES);",
     )
 
 
 def test_after_an_error_another_instance_computes(tmp_path: Path) -> None:
-    machine = loaded(write_machine(tmp_path, exported("dc_motor", changes={"sources/fmi2.c": _failing})))
+    machine = loaded(write_machine(tmp_path, exported("dc_motor", changes={"sources/both_versions.h": _failing})))
     assert machine.twin.fmu is not None
     instance = instance_of(machine.twin.fmu)
     ordinary = np.array([[item.start for item in machine.twin.fmu.arguments]])

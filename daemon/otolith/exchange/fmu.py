@@ -13,9 +13,10 @@ from otolith.exchange.fmi_variables import FmuVariables
 from otolith.exchange.model_description import Description, Version
 
 MAX_IDENTIFIER = 60  # characters of the name of the binary: file systems take 255
+SHARED = "both_versions.h", "instance.h"
 SAME_FILES = {
-    Version.TWO: ("fmi2.c", "instance.h", "fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    Version.THREE: ("fmi3.c", "instance.h", "fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+    Version.TWO: ("fmi2.c", *SHARED, "fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    Version.THREE: ("fmi3.c", *SHARED, "fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
 """Sources that are the same in each FMU of a version. The headers are those of the FMI standard, with its licence."""
 

@@ -19,17 +19,20 @@ static fmi2Status fail(const Instance *instance, const char *message)
     return fmi2Error;
 }
 
-static fmi2Status fail_with(const Instance *instance, const char *format, double number)
-{
-    char message[MESSAGE];
-    snprintf(message, sizeof message, format, number);
-    return fail(instance, message);
-}
+/* The names of this version, for both_versions.h. */
+#define FMI(Name) fmi2##Name
+#define fmi2Handle fmi2Component
+#define fmi2Number fmi2Real
+#define fmi2SavedState fmi2FMUstate
+#define fmi2GetSavedState fmi2GetFMUstate
+#define fmi2SetSavedState fmi2SetFMUstate
+#define fmi2FreeSavedState fmi2FreeFMUstate
+#define fmi2SavedStateSize fmi2SerializedFMUstateSize
+#define fmi2SerializeSavedState fmi2SerializeFMUstate
+#define fmi2DeserializeSavedState fmi2DeSerializeFMUstate
+#define fmi2GetRates fmi2GetDerivatives
 
-static fmi2Status unknown(const Instance *instance, size_t count, const char *message)
-{
-    return count == 0 ? fmi2OK : fail(instance, message);
-}
+#include "both_versions.h"
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
@@ -74,14 +77,6 @@ void fmi2FreeInstance(fmi2Component component)
     }
 }
 
-fmi2Status fmi2SetDebugLogging(fmi2Component component, fmi2Boolean logging, size_t count,
-                               const fmi2String categories[])
-{
-    (void)count, (void)categories;
-    ((Instance *)component)->logging = logging;
-    return fmi2OK;
-}
-
 fmi2Status fmi2SetupExperiment(fmi2Component component, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start,
                                fmi2Boolean has_stop, fmi2Real stop)
 {
@@ -97,12 +92,6 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component component) { (void)componen
 fmi2Status fmi2ExitInitializationMode(fmi2Component component) { (void)component; return fmi2OK; }
 
 fmi2Status fmi2Terminate(fmi2Component component) { (void)component; return fmi2OK; }
-
-fmi2Status fmi2Reset(fmi2Component component)
-{
-    begin(&((Instance *)component)->memory);
-    return fmi2OK;
-}
 
 fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference references[], size_t count, fmi2Real values[])
 {
@@ -145,67 +134,6 @@ NO_VARIABLES(SetInteger, fmi2Integer, const)
 NO_VARIABLES(SetBoolean, fmi2Boolean, const)
 NO_VARIABLES(SetString, fmi2String, const)
 
-fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *state)
-{
-    Instance *instance = component;
-    if (*state == NULL) {
-        *state = calloc(1, sizeof(Memory));
-    }
-    if (*state == NULL) {
-        return fail(instance, "no memory is left");
-    }
-    memcpy(*state, &instance->memory, sizeof(Memory));
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate state)
-{
-    if (state == NULL) {
-        return fail(component, "there is no such state of the FMU");
-    }
-    memcpy(&((Instance *)component)->memory, state, sizeof(Memory));
-    return fmi2OK;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *state)
-{
-    (void)component;
-    if (state != NULL) {
-        free(*state);
-        *state = NULL;
-    }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate state, size_t *size)
-{
-    (void)component, (void)state;
-    *size = sizeof(Memory);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate state, fmi2Byte bytes[], size_t size)
-{
-    if (state == NULL || size != sizeof(Memory)) {
-        return fail_with(component, "a state of this FMU has %.0f bytes", sizeof(Memory));
-    }
-    memcpy(bytes, state, size);
-    return fmi2OK;
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state)
-{
-    if (size != sizeof(Memory)) {
-        return fail_with(component, "a state of this FMU has %.0f bytes", sizeof(Memory));
-    }
-    *state = malloc(size);
-    if (*state == NULL) {
-        return fail(component, "no memory is left");
-    }
-    memcpy(*state, bytes, size);
-    return fmi2OK;
-}
-
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknowns[],
                                         size_t unknown_count, const fmi2ValueReference knowns[], size_t known_count,
                                         const fmi2Real seed[], fmi2Real sensitivity[])
@@ -226,64 +154,6 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
 }
 
 fmi2Status fmi2EnterContinuousTimeMode(fmi2Component component) { (void)component; return fmi2OK; }
-
-fmi2Status fmi2CompletedIntegratorStep(fmi2Component component, fmi2Boolean no_set_state, fmi2Boolean *enter_event_mode,
-                                       fmi2Boolean *terminate)
-{
-    (void)component, (void)no_set_state;
-    *enter_event_mode = *terminate = fmi2False;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetTime(fmi2Component component, fmi2Real time)
-{
-    set(&((Instance *)component)->memory, 0, time);
-    return fmi2OK;
-}
-
-static fmi2Status copy(Instance *instance, fmi2Real values[], size_t count, int first, int expected)
-{
-    if (count != (size_t)expected) {
-        return fail_with(instance, "the number of values must be %.0f", expected);
-    }
-    memcpy(values, current(&instance->memory) + first, count * sizeof values[0]);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real values[], size_t count)
-{
-    Instance *instance = component;
-    if (count != (size_t)STATES) {
-        return fail_with(instance, "the number of states is %.0f", STATES);
-    }
-    memcpy(instance->memory.variables + FIRST_STATE, values, count * sizeof values[0]);
-    instance->memory.is_current = 0;
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetContinuousStates(fmi2Component component, fmi2Real values[], size_t count)
-{
-    return copy(component, values, count, FIRST_STATE, STATES);
-}
-
-fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real values[], size_t count)
-{
-    return copy(component, values, count, FIRST_RATE, STATES);
-}
-
-fmi2Status fmi2GetEventIndicators(fmi2Component component, fmi2Real values[], size_t count)
-{
-    return copy(component, values, count, FIRST_INDICATOR, INDICATORS);
-}
-
-fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component component, fmi2Real values[], size_t count)
-{
-    if (count != (size_t)STATES) {
-        return fail_with(component, "the number of states is %.0f", STATES);
-    }
-    memcpy(values, NOMINAL, count * sizeof values[0]);
-    return fmi2OK;
-}
 
 /* Co-simulation */
 

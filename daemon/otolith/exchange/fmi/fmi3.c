@@ -19,17 +19,20 @@ static fmi3Status fail(const Instance *instance, const char *message)
     return fmi3Error;
 }
 
-static fmi3Status fail_with(const Instance *instance, const char *format, double number)
-{
-    char message[MESSAGE];
-    snprintf(message, sizeof message, format, number);
-    return fail(instance, message);
-}
+/* The names of this version, for both_versions.h. */
+#define FMI(Name) fmi3##Name
+#define fmi3Handle fmi3Instance
+#define fmi3Number fmi3Float64
+#define fmi3SavedState fmi3FMUState
+#define fmi3GetSavedState fmi3GetFMUState
+#define fmi3SetSavedState fmi3SetFMUState
+#define fmi3FreeSavedState fmi3FreeFMUState
+#define fmi3SavedStateSize fmi3SerializedFMUStateSize
+#define fmi3SerializeSavedState fmi3SerializeFMUState
+#define fmi3DeserializeSavedState fmi3DeserializeFMUState
+#define fmi3GetRates fmi3GetContinuousStateDerivatives
 
-static fmi3Status unknown(const Instance *instance, size_t count, const char *message)
-{
-    return count == 0 ? fmi3OK : fail(instance, message);
-}
+#include "both_versions.h"
 
 static Instance *instantiate(fmi3String token, fmi3Boolean logging, fmi3InstanceEnvironment environment,
                              fmi3LogMessageCallback log)
@@ -52,13 +55,6 @@ static Instance *instantiate(fmi3String token, fmi3Boolean logging, fmi3Instance
 }
 
 const char *fmi3GetVersion(void) { return fmi3Version; }
-
-fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean logging, size_t count, const fmi3String categories[])
-{
-    (void)count, (void)categories;
-    ((Instance *)instance)->logging = logging;
-    return fmi3OK;
-}
 
 fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
                                           fmi3Boolean logging, fmi3InstanceEnvironment environment,
@@ -121,12 +117,6 @@ MODE(Terminate)
 MODE(EnterConfigurationMode)
 MODE(ExitConfigurationMode)
 MODE(EvaluateDiscreteStates)
-
-fmi3Status fmi3Reset(fmi3Instance instance)
-{
-    begin(&((Instance *)instance)->memory);
-    return fmi3OK;
-}
 
 fmi3Status fmi3GetFloat64(fmi3Instance own, const fmi3ValueReference references[], size_t count, fmi3Float64 values[],
                           size_t value_count)
@@ -246,66 +236,6 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference
     return fail(instance, "the dependencies of variables are in modelDescription.xml");
 }
 
-fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state)
-{
-    if (*state == NULL) {
-        *state = calloc(1, sizeof(Memory));
-    }
-    if (*state == NULL) {
-        return fail(instance, "no memory is left");
-    }
-    memcpy(*state, &((Instance *)instance)->memory, sizeof(Memory));
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
-{
-    if (state == NULL) {
-        return fail(instance, "there is no such state of the FMU");
-    }
-    memcpy(&((Instance *)instance)->memory, state, sizeof(Memory));
-    return fmi3OK;
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
-{
-    (void)instance;
-    if (state != NULL) {
-        free(*state);
-        *state = NULL;
-    }
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state, size_t *size)
-{
-    (void)instance, (void)state;
-    *size = sizeof(Memory);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, fmi3Byte bytes[], size_t size)
-{
-    if (state == NULL || size != sizeof(Memory)) {
-        return fail_with(instance, "a state of this FMU has %.0f bytes", sizeof(Memory));
-    }
-    memcpy(bytes, state, size);
-    return fmi3OK;
-}
-
-fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size, fmi3FMUState *state)
-{
-    if (size != sizeof(Memory)) {
-        return fail_with(instance, "a state of this FMU has %.0f bytes", sizeof(Memory));
-    }
-    *state = malloc(size);
-    if (*state == NULL) {
-        return fail(instance, "no memory is left");
-    }
-    memcpy(*state, bytes, size);
-    return fmi3OK;
-}
-
 #define NO_DERIVATIVES(Name)                                                                                           \
     fmi3Status fmi3##Name(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t unknown_count,            \
                           const fmi3ValueReference knowns[], size_t known_count, const fmi3Float64 seed[],             \
@@ -327,64 +257,6 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *need_upd
     (void)instance; /* an event changes no state and no nominal value */
     *need_update = *terminate = *nominals_changed = *states_changed = *has_next_event = fmi3False;
     *next_event = 0.0;
-    return fmi3OK;
-}
-
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean no_set_state, fmi3Boolean *enter_event_mode,
-                                       fmi3Boolean *terminate)
-{
-    (void)instance, (void)no_set_state;
-    *enter_event_mode = *terminate = fmi3False;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time)
-{
-    set(&((Instance *)instance)->memory, 0, time);
-    return fmi3OK;
-}
-
-static fmi3Status copy(Instance *instance, fmi3Float64 values[], size_t count, int first, int expected)
-{
-    if (count != (size_t)expected) {
-        return fail_with(instance, "the number of values must be %.0f", expected);
-    }
-    memcpy(values, current(&instance->memory) + first, count * sizeof values[0]);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetContinuousStates(fmi3Instance own, const fmi3Float64 values[], size_t count)
-{
-    Instance *instance = own;
-    if (count != (size_t)STATES) {
-        return fail_with(instance, "the number of states is %.0f", STATES);
-    }
-    memcpy(instance->memory.variables + FIRST_STATE, values, count * sizeof values[0]);
-    instance->memory.is_current = 0;
-    return fmi3OK;
-}
-
-fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 values[], size_t count)
-{
-    return copy(instance, values, count, FIRST_STATE, STATES);
-}
-
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 values[], size_t count)
-{
-    return copy(instance, values, count, FIRST_RATE, STATES);
-}
-
-fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 values[], size_t count)
-{
-    return copy(instance, values, count, FIRST_INDICATOR, INDICATORS);
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 values[], size_t count)
-{
-    if (count != (size_t)STATES) {
-        return fail_with(instance, "the number of states is %.0f", STATES);
-    }
-    memcpy(values, NOMINAL, count * sizeof values[0]);
     return fmi3OK;
 }
 
