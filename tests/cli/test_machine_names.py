@@ -81,7 +81,7 @@ def machine_arguments() -> Iterator[tuple[str, str]]:
 def test_every_command_that_takes_a_machine_says_that_it_takes_both() -> None:
     rows = dict(machine_arguments())
     assert {"otolith watch", "otolith history", "otolith view", "otolith reset", "otolith baseline"} <= rows.keys()
-    own = {"otolith init", "otolith twin check"}  # a new file; a twin
+    own = {"otolith init", "otolith twin check", "otolith site"}  # a new file; a twin; a site
     assert {name: text for name, text in rows.items() if name not in own and not {"FILE", "MACHINE"} <= set(
         text.strip("[].").split("|"))} == {}  # fmt: skip
 
