@@ -53,8 +53,6 @@ class Machine:
     enabled: Callable[[float], bool] = lambda _: True
     current_zero: OfTime = lambda _: 0.0
     current_gain: OfTime = lambda _: 1.0
-    speed_zero: OfTime = lambda _: 0.0
-    load_zero: OfTime = lambda _: 0.0
     speed: OfTime = lambda time: (10.0, 20.0, 15.0, 5.0)[int(time // 7.0) % 4]  # Set-point
 
 
@@ -89,10 +87,6 @@ def _after(before: float, later: float, onset: float = ONSET, until: float = 1e9
     return lambda time: later if onset <= time < until else before
 
 
-def _ramp(rate: float) -> OfTime:
-    return lambda time: rate * max(time - ONSET, 0.0)
-
-
 SITUATIONS = (
     Situation("healthy: changing set-points", Machine()),
     Situation("healthy: constant speed", Machine(speed=lambda _: 12.0)),
@@ -108,17 +102,13 @@ SITUATIONS = (
     Situation("healthy: a product each 7 s", Machine(load=lambda time: LOAD * (1.0, 1.5, 0.7)[int(time // 7.0) % 3])),
     Situation("turns short out", Machine(resistance=_after(RESISTANCE, 0.91 * RESISTANCE)),
               ("winding-turns", "winding-turns-step")),
-    Situation("turns short out one after another",
-              Machine(resistance=lambda time: RESISTANCE - 0.008 * max(time - ONSET, 0.0)),
-              ("winding-turns", "winding-turns-step")),
     Situation("friction of the bearings x 2.5", Machine(damping=_after(DAMPING, 2.5 * DAMPING)),
               ("friction-step", "viscous-friction")),
     Situation("a load without a sensor", Machine(hidden_load=_after(0.0, 0.004)), ("constant-torque",)),
-    Situation("a load without a sensor that rises", Machine(hidden_load=_ramp(5e-5)),
+    Situation("a load without a sensor that rises", Machine(hidden_load=lambda time: 5e-5 * max(time - ONSET, 0.0)),
               ("constant-torque",)),
-    Situation("zero of the current drifts by 50 mA/min", Machine(current_zero=_ramp(0.05 / 60.0)), ("sensor",)),
-    Situation("zero of the speed drifts by 1 rad/s/min", Machine(speed_zero=_ramp(1.0 / 60.0)), ("sensor",)),
-    Situation("zero of the load drifts by 4 mN·m/min", Machine(load_zero=_ramp(0.004 / 60.0)), ("sensor",)),
+    Situation("zero of the current drifts by 50 mA/min",
+              Machine(current_zero=lambda time: 0.05 / 60.0 * max(time - ONSET, 0.0)), ("sensor",)),
     Situation("current reads 10 % more", Machine(current_gain=_after(1.0, 1.1)), ("sensor",)),
     Situation("current reads 10 % more, later turns short out",
               Machine(current_gain=_after(1.0, 1.1), resistance=_after(RESISTANCE, 0.91 * RESISTANCE, 80.0)),
@@ -142,8 +132,7 @@ def simulate(machine: Machine, seconds: float, seed: int) -> tuple[tuple[str, ..
         integral = float(np.clip(integral + INTEGRAL * error * PERIOD, -RANGE, RANGE)) if is_on else 0.0
         command = float(np.clip(CONSTANT * speed + GAIN * error + integral, -RANGE, RANGE)) if is_on else 0.0
         measured = machine.current_gain(time) * current + machine.current_zero(time)
-        load, shown_speed = machine.load(time) + machine.load_zero(time), speed + machine.speed_zero(time)
-        rows.append((command, load, measured, shown_speed))
+        rows.append((command, machine.load(time), measured, speed))
         for step in range(STEPS):
             now, length = time + step * PERIOD / STEPS, PERIOD / STEPS
             voltage = machine.supply(now) * command - machine.resistance(now) * current - CONSTANT * speed

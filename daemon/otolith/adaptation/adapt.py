@@ -24,9 +24,7 @@ from otolith.adaptation.state import (
     with_records,
 )
 from otolith.commissioning.input_noise import SUMMED_EVERY, SUMMED_RATIO
-from otolith.commissioning.slow_offsets import open_test as open_slow_test
-from otolith.commissioning.structure import PooledWindows
-from otolith.discovery.alternatives import ALTERNATIVES, DATA_FAULTS, UPDATES, PosteriorUpdate, WindowDecision
+from otolith.discovery.alternatives import DATA_FAULTS, UPDATES, PosteriorUpdate, WindowDecision
 from otolith.discovery.decision import (
     MAX_COST,
     AdoptedComponent,
@@ -38,7 +36,6 @@ from otolith.discovery.decision import (
     with_approvals,
 )
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.linear_response import LinearResponse
 from otolith.discovery.noise_hypothesis import likelier_levels_of, prior_inflation
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
@@ -116,12 +113,7 @@ def _kept(ledger: Ledger, decision: WindowDecision, before: Ledger) -> Ledger:
     only with accepted noise. The error of a sensor shifts no parameter.
     """
     if UPDATES[decision] is PosteriorUpdate.HYPOTHESIS:
-        is_noisier = decision is WindowDecision.NOISIER
-        return (
-            Ledger(offsets=ledger.offsets)
-            if is_noisier
-            else replace(ledger, cusum=ParameterCusum(), pooled=PooledWindows())
-        )
+        return Ledger() if decision is WindowDecision.NOISIER else Ledger(input_noise=ledger.input_noise)
     return replace(ledger, cusum=before.cusum) if decision in DATA_FAULTS else ledger
 
 
@@ -172,28 +164,18 @@ def _fit(
 ) -> tuple[_TestedEstimate | None, CheckedWindow]:
     """Return the estimate of a window and what was checked; None if its data are faulty, or a gap leaves nothing.
 
-    If the window is not expected because a sensor is saturated, the other samples are estimated from. It is not where
-    the best hypothesis of an open test explains all of them.
+    If the window is not expected because a sensor is saturated, the other samples are estimated from.
     """
     if not checked.is_usable:
         return None, checked
     search = SwarmSearch.NEVER if some_parameter_is_determined(state.previous) else SwarmSearch.FROM_BOUNDS
     tested, saturated = _TestedEstimate.of(predicted, checked.window, search), tuple[FaultySensor, ...]()
-    rest = None if tested.is_expected else without_saturated(predicted, checked.window)
-    if rest is not None and not _is_explained_by(state.test, checked.window):
+    if not tested.is_expected and (rest := without_saturated(predicted, checked.window)) is not None:
         window, sensor = rest
         tested, saturated = _TestedEstimate.of(predicted, window, search), (sensor,)
     if checked.window.bridge_error is not None and (gap := unbridged_gap(tested.estimated)):
         return None, replace(checked, bad=(gap,))
     return tested, replace(checked, faulty_sensors=saturated)
-
-
-def _is_explained_by(test: SequentialTest | None, window: Window) -> bool:
-    """Whether the best hypothesis of an open test explains the window."""
-    if test is None or test.best.type is FaultType.NOTHING:
-        return False
-    predicted = test.best.posterior.predict(window)
-    return fit_predicted(predicted, predicted.problem, window).is_explained
 
 
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
@@ -226,12 +208,6 @@ def _score(state: AdaptationState, tested: _TestedEstimate) -> _Scores:
     If it excludes a hypothesis on which windows agreed, it is scored again from the mixture of all that was open.
     """
     screening, cusum = _screen(state, tested), _parameter_cusum(state, tested)
-    ledger = replace(state.ledger, cusum=cusum)
-    if tested.estimated.is_explained and not _has_other_data_fault(state.test):
-        found = _slow_offset(state, tested, ledger, screening)
-        if isinstance(found, _Scores):
-            return found
-        ledger = found
     is_calm = tested.is_expected and not screening.is_positive
     test = _continued_test(state, tested, screening)
     if test is not None and _has_fallen(state.test, test):
@@ -241,35 +217,7 @@ def _score(state: AdaptationState, tested: _TestedEstimate) -> _Scores:
     is_new = test is None and not is_calm
     if is_new:
         state, test = replace(state, test=None), open_test(tested.predicted, screening)
-    return _Scores(state, tested, ledger, is_calm, test, is_new)
-
-
-def _has_other_data_fault(test: SequentialTest | None) -> bool:
-    """Whether the best hypothesis of an open test is that data are wrong by more than an offset."""
-    if test is None or not ALTERNATIVES[test.best.type].is_of_data:
-        return False
-    return [item.family for item in test.best.problem.components[len(test.problem.components) :]] != ["constant"]
-
-
-def _slow_offset(
-    state: AdaptationState, tested: _TestedEstimate, ledger: Ledger, screening: ScreeningResult
-) -> _Scores | Ledger:
-    """Return the test of offsets that windows together show to grow; else the ledger with the window."""
-    fitted, window = tested.estimated.fit, tested.estimated.fit.window
-    is_open = ledger.offsets.is_open and state.test is not None
-    # Beside an offset the filter has the values from before it, from which its effect is linear.
-    response = LinearResponse(fitted) if is_open else screening.response
-    offsets = replace(ledger.offsets, is_open=is_open).after(response, fitted.inflation)
-    change = offsets.change()
-    if change is None:
-        return replace(ledger, offsets=offsets.without_other_changes())
-    updated = tested.predicted.update(tested.innovation, tested.estimated.advance)
-    stayed, test = open_slow_test(change, state.posterior, (tested.predicted, updated), fitted)
-    if decide(test, state.learned).decision not in DATA_FAULTS | {WindowDecision.AMBIGUOUS}:
-        return replace(ledger, offsets=offsets)
-    ledger = replace(ledger, offsets=replace(offsets, is_open=True))
-    again = _TestedEstimate.of(stayed.predict(window), window)
-    return _Scores(replace(state, posterior=stayed), again, ledger, is_calm=False, test=test, is_new=False)
+    return _Scores(state, tested, replace(state.ledger, cusum=cusum), is_calm, test, is_new)
 
 
 def _decide_and_update(scores: _Scores) -> WindowResult:

@@ -8,7 +8,6 @@ import numpy as np
 from otolith.adaptation.fingerprints import fingerprint_of
 from otolith.adaptation.frozen_sensors import FrozenReading
 from otolith.commissioning.input_noise import InputNoiseSums
-from otolith.commissioning.slow_offsets import OffsetLedger
 from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
@@ -39,8 +38,6 @@ class Ledger:
     """The last windows that the twin explained, which are searched together."""
     input_noise: InputNoiseSums = field(default_factory=InputNoiseSums)
     """What windows show of the noise of inputs for which none is stated."""
-    offsets: OffsetLedger = field(default_factory=OffsetLedger)
-    """What windows show of offsets that grow slowly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

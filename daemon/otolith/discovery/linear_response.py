@@ -149,7 +149,7 @@ class LinearResponse(ProjectedResponse):
         """Linearise where ``fitted`` started."""
         self.problem, self.window, self.objective = fitted.problem, fitted.window, fitted.objective
         self.count = self.objective.count
-        start, residuals, jacobian = self._first = fitted.result.first
+        start, residuals, jacobian = fitted.result.first
         self._guess = self.objective.without_trends(start)
         self._unknowns, rows = Elimination.of(jacobian), len(residuals) - len(fitted.prior.mean)  # below is the prior
         remainder = self._unknowns.left(residuals)
@@ -255,21 +255,6 @@ class LinearResponse(ProjectedResponse):
 
     def _adjoint(self, linear: LinearisedModel, vectors: Array) -> Array:
         return self._kernel.adjoint(linear, self.objective.innovation_model, self.objective.present, vectors)
-
-    def information(self, curves: BasisFunctions) -> Array:
-        """Return what the window alone tells of parameters that stay constant, and of the amplitudes of ``curves``.
-
-        It is the triangular factor (rows, free + curves + 1) of their effects on the whitened innovations, without what
-        the initial state explains, and of the innovations where all are zero. Parameters are relative to their sizes.
-        """
-        start, residuals, jacobian = self._first
-        free, rows = len(self.problem.free), len(self._basis)
-        jacobian = jacobian[:rows]
-        constant, trends, states = jacobian[:, :free], jacobian[:, free : 2 * free], jacobian[:, 2 * free :]
-        there = residuals[:rows] - trends @ start[free : 2 * free] - constant @ start[:free]
-        columns = np.column_stack([states, constant * self.problem.scale, -self.responses(curves), there])
-        first = states.shape[1]
-        return np.asarray(np.linalg.qr(columns, mode="r"))[first:, first:]
 
     def squares_of_noise(self, vectors: Array | None = None) -> Array:
         """(signals + states, vectors) of squares: of the inner product with white noise of level one at each place.
