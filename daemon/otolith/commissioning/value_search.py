@@ -131,7 +131,7 @@ class ValueSearch:
         found = OwnValues((), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits)
         wide = [name for name in values if QUANTILE * spread[name] > DETERMINED * self._size(name, values[name])]
         differ = [name for name in values if abs(others[name] - values[name]) > DIFFERENT * sd[name]]
-        if wide and found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
+        if found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
             return replace(found, values=self._values(others, spread))
         faults = tuple(self._contradictions([name for name in wide if name[0] != "_"], values, others))
         return replace(found, values=self._values(values, spread), faults=faults)
