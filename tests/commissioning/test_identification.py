@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from otolith.acquisition.quality import time_text
 from otolith.acquisition.window import Array, Quality, TimeGrid, Verdict, Window
 from otolith.commissioning import identification as text
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states, sample_noise
@@ -296,7 +297,7 @@ def test_a_few_windows_that_contradict_all_others_are_left_out(disturbed: tuple[
     assert noise.windows == 10 - len(disturbed)
     assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.1)
     assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.05 * SENSORS.min())
-    starts = ", ".join(f"{2 * index} s" for index in disturbed)
+    starts = ", ".join(time_text(2.0 * index) for index in disturbed)
     assert text.EXCLUDED_OUTLYING.format(len(disturbed), 10, starts) in noise.remarks
 
 
@@ -335,7 +336,7 @@ def test_a_machine_that_changes_in_the_record_is_no_process_noise(
         windows.append(window(random, index, D=own) if name == "D" else window(random, index, R_a=own))
     noise = identify_noise(PROBLEM, windows)
     assert noise.consistency.remark == text.CONSISTENT
-    assert noise.remarks == (text.CHANGED.format(", ".join(f"{change} s" for change in changes)),)
+    assert noise.remarks == (text.CHANGED.format(", ".join(map(time_text, changes))),)
     assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.05)
     assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.05 * SENSORS.min())
 
@@ -345,6 +346,6 @@ def test_a_change_within_a_window_excludes_that_window() -> None:
     windows = [window(random, index, R_a=(1.1 if index > 6 else 1.0) * TRUTH["R_a"]) for index in range(16)]
     windows[7] = window(random, 7, R_a=1.05 * TRUTH["R_a"], hidden=0.01)
     noise = identify_noise(PROBLEM, windows)
-    assert text.EXCLUDED_OUTLYING.format(1, 16, "14 s") in noise.remarks
+    assert text.EXCLUDED_OUTLYING.format(1, 16, time_text(14.0)) in noise.remarks
     assert noise.consistency.remark == text.CONSISTENT
     assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.1 * SENSORS.min())

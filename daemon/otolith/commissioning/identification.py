@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from otolith.acquisition.quality import time_text
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.commissioning.consistency import (
     MAX_OUTLYING_SHARE,
@@ -275,7 +276,7 @@ def _without_outlying(
         if made.consistency.factor == 1.0 and scores[index] < OUTLYING:
             break
         start = best.fits[index].window.start
-        progress(f"without the window at {start:g} s")
+        progress(f"without the window at {time_text(start)}")
         trial = _without_window(guess, best, index, changes, progress)
         if trial is None:
             break
@@ -290,7 +291,7 @@ def _without_outlying(
 
 
 def _times(starts: Sequence[float]) -> str:
-    return ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(starts))
+    return ", ".join(map(time_text, sorted(starts)))
 
 
 def _without_window(

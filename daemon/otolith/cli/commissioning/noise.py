@@ -204,6 +204,7 @@ def level_rows(
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
     """The tables ``[noise]`` and ``[process_noise]``, with uncertainties and remarks as comments."""
+    from otolith.health.times import in_local_time
     from otolith_drivers.errors import counted
 
     tables = level_rows(machine, identified)
@@ -224,7 +225,7 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
         yield f"# chi-square between windows, per degree of freedom: {consistency.before:.3g}{after}{factor}"
     yield f"# {consistency.remark}"
     yield from _whiteness_lines(identified)
-    yield from (f"# {remark}" for remark in identified.remarks)
+    yield from (f"# {in_local_time(remark, machine.plan.timezone)}" for remark in identified.remarks)
 
 
 def _input_row(
