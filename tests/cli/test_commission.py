@@ -313,3 +313,10 @@ def test_a_time_without_estimates_gives_no_baseline(ran: Path) -> None:
 def test_which_data_are_healthy_must_be_told(arguments: list[str]) -> None:
     result = CliRunner().invoke(cli, ["commission", str(MACHINE), *arguments])
     assert result.exit_code == 2
+
+
+def test_data_that_are_read_again_warn_once(capsys: pytest.CaptureFixture[str]) -> None:
+    machine, data = load_machine(MACHINE, with_driver=False), HealthyLog((Path("monday.csv"),))
+    for later in ("", "two bad rows"):
+        noise.warn_once(machine, data, filter(None, ["one gap", later]))
+    assert_each_says(capsys.readouterr().err.splitlines(), ("monday.csv", "one gap"), ("monday.csv", "two bad rows"))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from otolith.cli.commissioning.components import equation_of, key_of_record, loaded
-from otolith.cli.common import ANY_DATA_FILES, MACHINE_FILE, echo_warnings, local_time, progress_line, restart_command
+from otolith.cli.common import ANY_DATA_FILES, MACHINE_FILE, local_time, progress_line, restart_command
 from otolith.cli.operation.baseline import keep_baseline
 from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
@@ -360,6 +360,7 @@ def _replayed(
     The number of findings and warnings are printed to standard error, with details each finding.
     """
     from otolith.adaptation.state import restore_components
+    from otolith.cli.commissioning.noise import warn_once
     from otolith.runtime.replay import Replay
     from otolith_drivers.errors import counted
 
@@ -379,7 +380,7 @@ def _replayed(
         if findings and not how.details:
             of = f"in {counted(with_findings, 'window')} of {windows}"
             echo(f"{counted(findings, 'finding')} {of} of the replay: --details prints them", err=True)
-        echo_warnings(data.path, run.warnings())
+        warn_once(machine, data, run.warnings())
         return run.state, advice
 
 

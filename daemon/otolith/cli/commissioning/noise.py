@@ -1,7 +1,7 @@
 """``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -62,6 +62,10 @@ class HealthyData(Protocol):
     def path(self) -> Path:
         """The file or folder that messages name."""
 
+    @property
+    def told(self) -> set[str]:
+        """What a person was warned of already."""
+
     def opened(self, machine: "LoadedMachine") -> "Reader":
         """Return a reader of the signals of ``machine``; raise ConfigurationError if there is nothing to read."""
 
@@ -71,6 +75,7 @@ class HealthyLog:
     """A log, or several, of which each is a recording of its own."""
 
     files: tuple[Path, ...]
+    told: set[str] = field(default_factory=set, compare=False)
 
     @property
     def path(self) -> Path:
@@ -91,6 +96,7 @@ class HealthySpan:
     machine: "LoadedMachine"
     begin: float
     end: float
+    told: set[str] = field(default_factory=set, compare=False)
 
     @property
     def path(self) -> Path:
@@ -154,6 +160,15 @@ def identified_record(machine: "LoadedMachine", data: HealthyData, count: int) -
     return record
 
 
+def warn_once(machine: "LoadedMachine", data: HealthyData, lines: Iterable[str]) -> None:
+    """Print what a replay of ``data`` warns of, but for what an earlier one has."""
+    from otolith.health.times import in_local_time
+
+    local = [in_local_time(line, machine.plan.timezone) for line in lines]
+    echo_warnings(data.path, [line for line in local if line not in data.told])
+    data.told.update(local)
+
+
 def good_windows(machine: "LoadedMachine", data: HealthyData, count: int) -> list["Window"]:
     """At most ``count`` good windows, spread over the data; raise UnusableData, with why, if there is none."""
     from otolith.runtime.preview import EvenSpread
@@ -169,7 +184,7 @@ def good_windows(machine: "LoadedMachine", data: HealthyData, count: int) -> lis
                     reasons = window.quality.reasons
                 else:
                     spread.add(window)
-            echo_warnings(data.path, run.warnings())
+            warn_once(machine, data, run.warnings())
     except ConfigurationError as error:
         raise UnusableData(str(error), error.key) from error
     if not (chosen := spread.chosen()):
