@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.cli.console import Terminal
+from otolith.cli.operation.live_table import LiveTable
 from otolith.health.schema import LANGUAGES, Language, ReportDocument, Status
 from otolith.health.text import performance_texts, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
@@ -182,7 +185,7 @@ def test_a_machine_without_a_load_sensor_has_a_reason_or_a_value(
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-def test_history_and_page_have_them(
+def test_history_page_and_live_table_have_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: MotorScenario, windows: Cut, language: Language
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
@@ -200,10 +203,15 @@ def test_history_and_page_have_them(
     (sample,) = reader.samples(WINDOW, 0.0, (name,))
     assert sample.last == pytest.approx(figures["P_Cu"].value)
     page = html_report(reader, reader.samples(WINDOW, 0.0), "window", 0.0, last.window.end)
+    table, output = LiveTable(lambda: "", details=True), StringIO()
+    table.add(last.to_json())
+    Terminal(file=output, width=1000).print(table)
+    shown = output.getvalue()
     texts = texts_in(language)
     assert texts("performance") in page
     for figure in figures.values():
         assert texts.translated(figure.meaning) in page
+        assert texts.translated(figure.meaning) in shown
         assert len(performance_texts(figure, texts)) == 3
     assert name not in page
 

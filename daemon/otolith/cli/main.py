@@ -234,7 +234,7 @@ def replay(
 @click.argument("machine", metavar="[FILE|MACHINE]", default="*", callback=_watched)
 @reader_options
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
-@click.option("--details", is_flag=True, help="Also show the candidates while a cause is not yet known.")
+@click.option("--details", is_flag=True, help="Also candidates while a cause is not yet known, hints, what it costs.")
 @click.option("--after", type=click.IntRange(0), metavar="NUMBER",
               help="With --json: begin after the report with this sequence number.")  # fmt: skip
 def watch(

@@ -34,6 +34,7 @@ from otolith.health.text import (
     headline,
     interval_text,
     note_texts,
+    performance_texts,
     probability_text,
     texts_in,
     undecided_advice,
@@ -116,6 +117,7 @@ class _Machine:
             table,
         ]
         parts += [_components(document, width, texts)] if document.components else []
+        parts += _performance(document, texts) if details else []
         return [*parts, *_messages(document, texts, details=details), *_counters(document, texts)]
 
 
@@ -300,6 +302,12 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
         table.add_row(*cells)
         lines.append(Text("{}: {}: {}, {}, {}".format(*cells)))
     return Group(*lines) if width < WIDTH_WITH_COMPONENTS else table
+
+
+def _performance(document: ReportDocument, texts: Texts) -> list[Text]:
+    """What the machine costs or yields now, against the healthy machine and at a limit."""
+    rows = (document.performance or {}).values()
+    return [Text(f"{texts.translated(row.meaning)}: {PARTS.join(performance_texts(row, texts))}") for row in rows]
 
 
 def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[Text]:
