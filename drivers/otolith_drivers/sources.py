@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import astuple
 
-from otolith_drivers.base import Counters, Deliver, Link, Sampling, SourceState, sampling_of
+from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.reconnection import CLOSE_TIMEOUT
 from otolith_drivers.errors import DeviceError
@@ -26,11 +26,11 @@ class SeveralSources:
         kinds = [(source, source.sampling) for source in self._sources]
         return {signal: sampling_of(kind, signal) for source, kind in kinds for signal in source.signals}
 
-    def open(self, deliver: Deliver) -> None:
-        """See :meth:`Driver.open`; a source that cannot be opened does not keep the others back.
+    def open(self, deliver: Deliver, *, patiently: bool = False) -> None:
+        """See :meth:`Driver.open`; a source that cannot be opened does not keep the others back, and is tried again.
 
         Raises:
-            DeviceError: no source can be opened.
+            DeviceError: no source can be opened, and it was not to be done ``patiently``.
         """
         faults = dict[str, str]()
         for source in self._sources:
@@ -38,7 +38,7 @@ class SeveralSources:
                 source.open(deliver)
             except DeviceError as error:
                 faults[source.name] = str(error)
-        if len(faults) == len(self._sources):
+        if len(faults) == len(self._sources) and not patiently:
             self.close()
             raise DeviceError("; ".join(f"source {name!r}: {fault}" for name, fault in faults.items()))
         for source in self._sources:
@@ -88,3 +88,11 @@ class SeveralSources:
             first, *rest = source.describe()
             lines += [f"source {source.name}: {first}", *rest]
         return lines
+
+
+def open_patiently(driver: Driver, deliver: Deliver) -> None:
+    """Open a driver; if the computer lacks what it needs, it is tried again until it is closed."""
+    if isinstance(driver, GuardedSource | SeveralSources):
+        driver.open(deliver, patiently=True)
+    else:
+        driver.open(deliver)

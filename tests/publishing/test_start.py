@@ -78,7 +78,7 @@ class Recorded:
 def test_the_service_tells_each_step_once() -> None:
     service, recorded = Service(load_machine(EXAMPLES / "dc-motor-in-process.toml")), Recorded()
     hall = Daemon([service])
-    service._publisher = hall._notifier = recorded  # type: ignore[assignment]  # has the methods that are used
+    service.publisher = hall._notifier = recorded  # type: ignore[assignment]  # has the methods that are used
     for prepared, is_ready in (([], False), ([], False), ([True], False), ([True, True], False), ([True] * 11, True)):
         (worker,) = hall._pool.workers
         worker.prepared, worker.is_ready = list(prepared), is_ready

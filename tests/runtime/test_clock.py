@@ -91,7 +91,7 @@ class Daemons:
         service._start_clock()
         service.machine.state = service._restored(service.machine.state)
         service._start_history()
-        service._publisher = self  # type: ignore[assignment]
+        service.publisher = self  # type: ignore[assignment]
         return service
 
     def publish(self, document: ReportDocument) -> None:

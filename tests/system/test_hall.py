@@ -15,15 +15,18 @@ import pytest
 from otolith.cli.run import serve
 from otolith.health.limits import Level
 from otolith.health.schema import ReportDocument
+from otolith.machine import load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith.storage.history import HistoryReader, history_path
+from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.messages import raises_saying
 from tests.waiting import PATIENCE, wait_for
 
 GOOD = ("one", "two")
+LEARNED_BY_ANOTHER = "what another daemon has learned"
 ENDPOINT = "unixsock-stream/{folder}/reports.sock"
 
 
@@ -99,9 +102,14 @@ def hall(folder: Path) -> Iterator[RunningHall]:
         own = f'{{ register = {2 * number}, type = "float32", unit = "{unit}" }}'
         text = text.replace(f'{{ signal = "{name}" }}', own)
     (folder / "dead-bus.toml").write_text(text, encoding="utf-8")
+    write(folder, "busy")
+    other = store_of(load_machine(folder / "busy.toml", with_driver=False))
     write(folder, "other-name")
     (folder / "other-name.toml").write_text((folder / "one.toml").read_text(encoding="utf-8"), encoding="utf-8")
-    running = RunningHall(folder)
+    with other.locked():  # by this process, as by another daemon
+        other.components_path.write_text(LEARNED_BY_ANOTHER, encoding="utf-8")
+        running = RunningHall(folder)
+        running.have(1, *GOOD)
     yield running
     if running.daemon.poll() is None:
         running.close()
@@ -128,6 +136,10 @@ def test_what_is_wrong_with_a_machine_harms_no_other(hall: RunningHall, folder: 
         assert last is not None
         assert (last.windows_missed, last.lost, last.worker_restarts) == (first.windows_missed, 0, 1)
     assert hall.close() == 0
+    assert not hall.reports["busy"]
+    (learned,) = (folder.parent / "state" / "otolith" / "components").glob("demo.busy*json")
+    assert learned.read_text(encoding="utf-8") == LEARNED_BY_ANOTHER
+    assert not history_path("demo", "busy").exists()
     for name in GOOD:
         kept = HistoryReader(history_path("demo", name)).messages("report", 1000)
         assert {report.sequence for report in hall.reports[name]} <= {

@@ -65,6 +65,9 @@ def _loaded(paths: Sequence[Path]) -> list["LoadedMachine"]:
         except ConfigurationError as error:
             log.error("not served: %s", "; ".join(str(error).split("\n")))  # noqa: TRY400 - no traceback
             continue
+        except Exception:  # no file of a hall ends it
+            log.exception("%s: not served", path)
+            continue
         names = machine.file.machine.site, machine.file.machine.name
         if names in machines:
             log.error("%s: not served: %s has machine %s at %s", path, machines[names].path, names[1], names[0])

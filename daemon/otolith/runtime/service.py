@@ -47,6 +47,7 @@ from otolith.storage.history_writer import history_of
 from otolith.storage.state_store import LockedError, StateWriter, store_of
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import OtolithError, ServiceError
+from otolith_drivers.sources import open_patiently
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ class Service:
         self._described: MonitoringPlan | None = None  # by the history
         self._recorder = RecorderSupervisor(machine, recording, None if shared is None else shared.recorder)
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
-        self._publisher: Publisher | None = None
+        self.publisher: Publisher | None = None
         self._started_at = 0.0
         self._summarised_at = -math.inf
         self._logged: ReportDocument | None = None  # The last report with a line in the log
@@ -209,16 +210,19 @@ class Service:
         self.machine.state = self._restored(self.machine.state)
         self._start_history()
 
-    def open(self, publisher: Publisher) -> str:
+    def open(self, publisher: Publisher, *, patiently: bool = False) -> str:
         """Listen to the machine, and return where, in words.
 
         Raises:
-            DeviceError: the machine's bus cannot be opened.
+            DeviceError: the machine's bus cannot be opened; ``patiently`` it is tried again instead.
             ServiceError: a file that the caller named cannot be recorded.
         """
-        self._publisher = publisher
+        self.publisher = publisher
         driver = self._loaded.driver
-        driver.open(self.machine.rings.deliver)
+        if patiently:
+            open_patiently(driver, self.machine.rings.deliver)
+        else:
+            driver.open(self.machine.rings.deliver)
         self._writer.start()
         self._evidence.start()
         if self._recorder.is_enabled:
@@ -326,17 +330,15 @@ class Service:
         if change.limits:
             # The decisions contain the baselines to which limits in percent refer.
             self.machine.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
-        if self._publisher is not None:  # also if the files have the same names as before
-            self._publisher.reload(self.access)
         if change.recording:
             self._recorder.reload(self._loaded, time.monotonic())
 
     def show_preparation(self, shown: Preparation, *, is_done: bool) -> None:
         """Tell readers how many kernels the workers have: until they are ready there is no report."""
-        if self._publisher is None:
+        if self.publisher is None:
             return
         identity, done = self._loaded.file.machine, shown.total if is_done else shown.done
-        self._publisher.publish_start(
+        self.publisher.publish_start(
             StartDocument(site=identity.site, machine=identity.name, done=done, total=shown.total, text=shown.text)
         )
 
@@ -372,7 +374,7 @@ class Service:
             "evidence": self._evidence.outage,
             "recording": self._recorder.outage,
             "on_event": self._command.outage,
-            **({} if self._publisher is None else self._publisher.outages(datetime.now(UTC))),
+            **({} if self.publisher is None else self.publisher.outages(datetime.now(UTC))),
         }
         self._failing = {name: self._failing.get(name, now) for name, reason in reasons.items() if reason}
         return {name: reasons[name] for name, since in self._failing.items() if now - since >= OUTAGE_AFTER}
@@ -388,7 +390,7 @@ class Service:
 
     def _publish(self, report: Report, seconds: float, restarts: int = 0) -> str:
         document, noted = report.document, self._noted
-        self._noted, warning = (), "" if self._publisher is None else self._publisher.warning(datetime.now(UTC))
+        self._noted, warning = (), "" if self.publisher is None else self.publisher.warning(datetime.now(UTC))
         latency = max(0.0, self._clock.now() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         driver = driver_document(self._loaded.driver.link())
@@ -402,8 +404,8 @@ class Service:
             self._history.labels = self._clock.labels
             self._history.add(document)
         document = self._clock.labels.of_report(document)
-        if self._publisher is not None:
-            self._publisher.publish(document)
+        if self.publisher is not None:
+            self.publisher.publish(document)
         if self._recorder.is_enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
         return self._log(document, time.monotonic())
@@ -447,8 +449,8 @@ class Service:
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         short, self._logged = summary(document, self._logged), document
         self._summarised_at = now if is_due else self._summarised_at
-        if is_due and self._publisher is not None:
-            self._warn_of_expiry(self._publisher, datetime.now(UTC))
+        if is_due and self.publisher is not None:
+            self._warn_of_expiry(self.publisher, datetime.now(UTC))
         is_shown = is_due or (self._shared is None and sys.stderr.isatty())
         log.log(logging.INFO if is_shown else logging.DEBUG, "%s", line if is_due else short)
         return line

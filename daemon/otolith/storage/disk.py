@@ -35,6 +35,7 @@ class WriterThread(ABC):
         self._retry_at, self._last_error = 0.0, ""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._shared: StorageThread | None = None
+        self._is_started = False
 
     @property
     def outage(self) -> str:
@@ -47,6 +48,7 @@ class WriterThread(ABC):
 
     def start(self) -> None:
         """Start the thread."""
+        self._is_started = True
         if self._shared is None:
             self._thread.start()
         else:
@@ -55,7 +57,7 @@ class WriterThread(ABC):
     def wake(self) -> None:
         """Let the thread write soon."""
         self._wakeup.set()
-        if self._shared is not None:
+        if self._shared is not None and self._is_started:
             self._shared.wake(self)
 
     def stop(self, seconds: float) -> None:

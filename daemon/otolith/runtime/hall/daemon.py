@@ -14,6 +14,7 @@ import heapq
 import logging
 import os
 import signal
+import sqlite3
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -51,9 +52,8 @@ class Daemon:
         self._services = {service.machine: service for service in services}
         self._shared, self._is_alone = shared, shared is None
         self._pool = Pool(list(self._services), workers)
-        self._due = [(0.0, number, machine) for number, machine in enumerate(self._services)]
+        self._due: list[tuple[float, int, Machine]] = []
         self._publishers: list[Publisher] = []
-        self._open: list[Service] = []
         self._notifier = Notifier()
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
@@ -90,39 +90,57 @@ class Daemon:
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
         protect_files()
-        prepared = []
-        for service in self._services.values():
+        for service in self._served:
             with self._alone_or_left_out(service):
                 service.prepare()
-                prepared.append(service)
-        for group in _groups(prepared):
-            published = [service.published for service in group]
-            publisher = Publisher(published, group[0].listen, group[0].access)
-            self._publishers.append(publisher)
-            for service in group:
-                with self._alone_or_left_out(service):
-                    text = service.open(publisher)
-                    self._open.append(service)
-        if not self._open:
+        for group in _groups(self._served):
+            with self._alone_or_left_out(*group):
+                published = [service.published for service in group]
+                publisher = Publisher(published, group[0].listen, group[0].access)
+                self._publishers.append(publisher)
+                for service in group:
+                    with self._alone_or_left_out(service):
+                        text = service.open(publisher, patiently=not self._is_alone)
+        if not self._services:
             raise ServiceError("no machine can be served: the lines above say why")
+        self._due = [(0.0, number, machine) for number, machine in enumerate(self._services)]
         self._pool.start(time.monotonic())
-        listening = text if self._is_alone else f"to {counted(len(self._open), 'machine')}"
+        listening = text if self._is_alone else f"to {counted(len(self._services), 'machine')}"
         self._notifier.send("READY=1", f"STATUS=listening: {listening}", f"MAINPID={os.getpid()}")
 
+    @property
+    def _served(self) -> list[Service]:
+        """The machines that are not left out."""
+        return list(self._services.values())
+
     @contextlib.contextmanager
-    def _alone_or_left_out(self, service: Service) -> Iterator[None]:
-        """Leave a machine out that cannot be served; if it is alone, raise the error."""
-        with about("" if self._is_alone else service.title):
-            try:
-                yield
-            except OtolithError as error:
-                if self._is_alone:
-                    raise
-                log.error("not served: %s", error)  # noqa: TRY400 - a fault of a machine needs no traceback
+    def _alone_or_left_out(self, *services: Service) -> Iterator[None]:
+        """Leave machines out that cannot be served; if there is one only, raise the error."""
+        try:
+            yield
+        except Exception as error:
+            if self._is_alone:
+                raise
+            for service in services:
+                self._leave_out(service, error)
+
+    def _leave_out(self, service: Service, error: Exception) -> None:
+        """Serve a machine no longer: another daemon may, and nothing of it is written any more."""
+        with about(service.title):
+            is_known = isinstance(error, OtolithError | OSError | sqlite3.Error)
+            log.error("not served: %s", error, exc_info=None if is_known else error)
+            del self._services[service.machine]
+            self._due = [row for row in self._due if row[2] is not service.machine]
+            heapq.heapify(self._due)
+            self._pool.leave_out(service.machine)
+            with contextlib.ExitStack() as steps:
+                steps.callback(service.unlock)
+                service.stop_outputs(steps)
+                steps.callback(service.close_driver)
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""
-        services, count = list(self._services.values()), len(self._services)
+        services, count = self._served, len(self._services)
         with contextlib.ExitStack() as steps:
             for service in services:
                 steps.callback(service.unlock)
@@ -144,9 +162,19 @@ class Daemon:
 
     def _reload(self) -> None:
         self._is_reload_due = False
-        for service in self._open:
-            with about("" if self._is_alone else service.title):
+        for service in self._served:
+            with self._guarded(service, "not reloaded"):
                 service.reload()
+        for publisher in self._publishers:
+            self._reload_access(publisher, [service for service in self._served if service.publisher is publisher])
+
+    def _reload_access(self, publisher: Publisher, group: Sequence[Service]) -> None:
+        """Let a session take over who may read, if all machines that share it say the same."""
+        if len(_groups(group)) == 1:
+            publisher.reload(group[0].access)
+        elif group:
+            names = ", ".join(service.title for service in group)
+            log.warning("only a restart takes over who may read, as the files of %s no longer say the same", names)
 
     def _step(self) -> None:
         """Hand the samples of due windows to workers, publish finished reports, supervise the processes."""
@@ -156,7 +184,8 @@ class Daemon:
             heapq.heappush(self._due, (self._take_due(machine, now), number, machine))
         wait(self._pool.waitables, timeout=min(MAX_WAIT, self._due[0][0] - now))
         for machine, finished in self._pool.poll(time.monotonic()):
-            service = self._services[machine]
+            if (service := self._services.get(machine)) is None:
+                continue
             with self._guarded(service):
                 line = service.finish(finished, self._pool.restarts)
                 self._show_status(line, time.monotonic())
@@ -165,11 +194,14 @@ class Daemon:
         self._feed_watchdog(now)
         if now - self._recorders_at >= RECORDER_INTERVAL or self._is_alone:
             self._recorders_at = now
-            for service in self._open:
+            for service in self._served:
                 with self._guarded(service):
                     service.poll_recorder(now)
-                    if service.locked_out is not None:
+                if service.locked_out is not None:
+                    with self._alone_or_left_out(service):
                         raise service.locked_out
+            if not self._services:
+                raise ServiceError("no machine is served any more: the lines above say why")
 
     def _take_due(self, machine: Machine, now: float) -> float:
         """Submit the windows of a machine that are due; return when to ask it again."""
@@ -181,7 +213,7 @@ class Daemon:
         return due if due > now else now + MAX_WAIT
 
     @contextlib.contextmanager
-    def _guarded(self, service: Service) -> Iterator[None]:
+    def _guarded(self, service: Service, what: str = "this window is not served") -> Iterator[None]:
         """In a hall, log what goes wrong with a machine instead of ending the service."""
         if self._is_alone:
             yield
@@ -190,7 +222,7 @@ class Daemon:
             try:
                 yield
             except Exception:
-                log.exception("this window is not served")
+                log.exception("%s", what)
 
     def _show_preparation(self) -> None:
         """Tell readers and systemd how many kernels a worker has that is not ready: until then there is no report."""
@@ -200,7 +232,7 @@ class Daemon:
         if (shown := now or before) is None:
             return
         self._notifier.send(f"STATUS={shown.text if now else 'the first window is computed'}")
-        for service in self._services.values():
+        for service in self._served:
             service.show_preparation(shown, is_done=now is None)
 
     def _show_status(self, line: str, now: float) -> None:
@@ -211,7 +243,7 @@ class Daemon:
             self._status_at = now
             finished = sum(machine.finished for machine in self._services)
             missed = sum(machine.missed for machine in self._services)
-            machines = counted(len(self._open), "machine")
+            machines = counted(len(self._services), "machine")
             self._notifier.send(f"STATUS={machines}: {finished} windows finished, {missed} missed")
 
     def _feed_watchdog(self, now: float) -> None:

@@ -143,6 +143,12 @@ class Pool:
             self._start(worker)
             worker.stall.begin(now, worker.process.processor_time)
 
+    def leave_out(self, machine: Machine) -> None:
+        """Compute no further window of a machine."""
+        self._machines = tuple(own for own in self._machines if own is not machine)
+        if machine in self._queue:
+            self._queue.remove(machine)
+
     def submit(self, machine: Machine, task: Task, now: float) -> None:
         """Compute a window of a machine as soon as a worker is free."""
         machine.submit(task, NOT_READY if self.preparation else BEHIND)
@@ -215,12 +221,13 @@ class Pool:
             self._enqueue(machine)
 
     def _enqueue(self, machine: Machine) -> None:
-        if machine.is_waiting and machine not in self._queue:
+        if machine.is_waiting and machine in self._machines and machine not in self._queue:
             self._queue.append(machine)
 
     def _start(self, worker: Worker) -> None:
         """Start a worker; if the twin of a machine kills it meanwhile, the next one begins with another machine."""
-        worker.start(self._machines[worker.process.starts % len(self._machines)].state)
+        number = worker.process.starts + self.workers.index(worker)
+        worker.start(self._machines[number % len(self._machines)].state)
 
     def _dispatch(self, now: float) -> None:
         for worker in self.workers:
