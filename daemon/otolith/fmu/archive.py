@@ -4,6 +4,7 @@ Only its description is read until a process has to evaluate it. Its binaries an
 folder of this user alone, by the digest of the archive: a file that was changed meanwhile is refused.
 """
 
+import contextlib
 import hashlib
 import io
 import os
@@ -13,11 +14,13 @@ import shutil
 import stat
 import tempfile
 import zipfile
+import zlib
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from otolith.fmu.reference import FmuReference
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.outside_text import visible
 from otolith_drivers.user_dirs import cache_directory
 
@@ -31,7 +34,10 @@ KEPT = 8  # unpacked archives, the latest
 DESCRIPTION = "modelDescription.xml"
 USED = ("binaries/", "resources/")
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
-READ_ERRORS = (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError)
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of the standard; zipfile limits what these unpack at a time
+CHUNK = 1 << 16  # bytes
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OverflowError)
+READ_ERRORS = (OSError, NotImplementedError, RuntimeError, ValueError, *DAMAGED)
 
 
 class FmuArchive(NamedTuple):
@@ -61,7 +67,7 @@ def _checked(path: Path, content: bytes) -> FmuArchive:
                 raise ValueError(
                     f"{DESCRIPTION} has {size >> 20} MB: at most {MAX_DESCRIPTION_BYTES >> 20} MB are read"
                 )
-            description = archive.read(DESCRIPTION)
+            description = b"".join(_chunks(archive, archive.getinfo(DESCRIPTION)))
     except READ_ERRORS as error:
         raise ValueError(_reason(error)) from error
     return FmuArchive(path, hashlib.sha256(content).hexdigest(), names, description)
@@ -78,10 +84,27 @@ def _content(path: Path) -> bytes:
         raise ValueError(f"cannot be read: {error.strerror}") from error
 
 
+def _chunks(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[bytes]:
+    """Return the content of a member, by small parts and of the size that the archive declares.
+
+    Reading a member at once would unpack all of its stream before its size is compared.
+    """
+    count = 0
+    with archive.open(member) as stream:
+        while chunk := stream.read(CHUNK):
+            if (count := count + len(chunk)) > member.file_size:
+                break
+            yield chunk
+    if count != member.file_size:
+        name = repr(visible(member.filename, 80))
+        raise zipfile.BadZipFile(f"its member {name} has another size than it declares, {member.file_size} bytes")
+
+
 def _reason(error: Exception) -> str:
-    if isinstance(error, zipfile.BadZipFile):
-        return f"is no archive, or a damaged one: {visible(str(error), 200)}"
-    return visible(str(error), 300) or type(error).__name__
+    text = visible(str(error), 200) or type(error).__name__
+    if isinstance(error, DAMAGED):
+        return f"is no archive, or a damaged one: {text}: export it again"
+    return text
 
 
 def _check_members(members: list[zipfile.ZipInfo]) -> None:
@@ -100,6 +123,9 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
             raise ValueError(f"its member {shown} is in it twice")
         if member.flag_bits & 1:
             raise ValueError(f"its member {shown} is encrypted")
+        if member.compress_type not in PACKINGS:
+            packing = f"by method {member.compress_type} of zip"
+            raise ValueError(f"its member {shown} is packed {packing}, an FMU by deflate only: export it with that")
         if member.file_size > max(RATIO_BYTES, MAX_RATIO * member.compress_size):
             packed = f"{member.compress_size} bytes packed"
             raise ValueError(f"its member {shown} has {member.file_size >> 20} MB, {packed}: a bomb")
@@ -130,10 +156,9 @@ def unpacked(reference: FmuReference) -> Path:
     """Return the folder with binaries and resources of an FMU.
 
     Raises:
-        ConfigurationError: the archive was changed since its description was read.
-        ServiceError: the cache cannot be used.
+        ConfigurationError: the archive was changed since its description was read, or cannot be unpacked.
     """
-    store = cache_directory("fmus")
+    store = store_of(reference)
     folder = store / reference.digest
     if not folder.is_dir():
         path = Path(reference.path)
@@ -143,26 +168,49 @@ def unpacked(reference: FmuReference) -> Path:
             raise ConfigurationError(f"{reference.path}: {error}") from error
         if archive.digest != reference.digest:
             raise ConfigurationError(f"{reference.path}: was changed since it was checked: start again")
-        temporary = Path(tempfile.mkdtemp(prefix="new-", dir=store))
         try:
-            _unpack(content, temporary)
-            if not folder.is_dir():
-                temporary.rename(folder)
+            _unpack(content, folder)
         except OSError as error:
-            if not folder.is_dir():  # another process has unpacked it
-                raise ConfigurationError(f"{reference.path}: cannot be unpacked: {error.strerror}") from error
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            raise ConfigurationError(no_room(reference, store, error)) from error
+        except READ_ERRORS as error:
+            raise ConfigurationError(f"{reference.path}: {_reason(error)}") from error
         _remove_old(store, folder)
-    os.utime(folder)
+    with contextlib.suppress(OSError):  # as on a disk that became read-only: it is used as it is
+        os.utime(folder)
     return folder
 
 
+def store_of(reference: FmuReference) -> Path:
+    """Return the folder of this user for unpacked FMUs; raise ConfigurationError if there can be none."""
+    try:
+        return cache_directory("fmus")
+    except ServiceError as error:
+        raise ConfigurationError(f"{reference.path}: has no cache in which it could be tried: {error}") from error
+
+
+def no_room(reference: FmuReference, store: Path, error: OSError) -> str:
+    """Return what to say where the folder of unpacked FMUs cannot be written."""
+    return f"{reference.path}: {store} cannot be written: {error.strerror or error}: make room there"
+
+
 def _unpack(content: bytes, folder: Path) -> None:
-    with zipfile.ZipFile(io.BytesIO(content)) as opened:
-        for member in opened.infolist():
-            if member.filename.startswith(USED) and not member.is_dir():
-                opened.extract(member, folder)
+    """Make a folder of what is used of an archive, at once."""
+    temporary = Path(tempfile.mkdtemp(prefix="new-", dir=folder.parent))
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as opened:
+            for member in opened.infolist():
+                if member.filename.startswith(USED) and not member.is_dir():
+                    target = temporary / member.filename
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    with target.open("wb") as file:
+                        file.writelines(_chunks(opened, member))
+        try:
+            temporary.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # another process has unpacked it
+                raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _remove_old(store: Path, keep: Path) -> None:

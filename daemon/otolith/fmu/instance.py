@@ -50,8 +50,8 @@ class FmuInstance:
         self.reference = reference
         self._table = np.zeros(calls.ENTRIES, dtype=np.int64)
         self._buffers: list[NDArray[Any]] = []  # They must live as long as their addresses
-        self._is_dead = False
         width, height = len(reference.arguments), len(reference.rows)
+        self._fault = "the FMU reported a fatal error"  # Why it must not be called any more, once its status says so
         self._arguments, self._slopes = np.zeros(width), np.zeros(width * height)
         self._wanted = np.zeros(len(reference.parameters) or 1, dtype=np.uint8)
         try:
@@ -74,15 +74,20 @@ class FmuInstance:
     def recover(self) -> None:
         """Replace the instance if it has reported an error; raise RuntimeError if it must not be called again."""
         status = int(self._table[calls.STATUS])
-        self._table[calls.STATUS] = 0
         if status >= FATAL:
-            self._is_dead = True
-        if self._is_dead:
-            raise RuntimeError(f"{self.reference.path}: the FMU reported a fatal error: it must be mended")
+            raise RuntimeError(f"{self.reference.path}: {self._fault}: it must be mended")
         if status >= calls.FAILED:
             log.warning("%s: the FMU reported an error and is instantiated anew", self.reference.path)
+            self._table[calls.STATUS] = FATAL  # kernels call nothing while there is no instance, or if none starts
+            self._table[calls.INSTANCE] = 0
             getattr(self._own, f"fmi{self.reference.version}FreeInstance")(self._own.component)
-            self._begin()
+            try:
+                self._begin()
+            except Exception as error:  # as at the start
+                text = visible(str(error) or type(error).__name__, MAX_MESSAGE)
+                self._fault = f"the FMU does not start again after an error: {text}"
+                raise RuntimeError(f"{self.reference.path}: {self._fault}: it must be mended") from error
+        self._table[calls.STATUS] = 0
 
     def rows(self, arguments: Column) -> Column:
         """Return rates and outputs (records, rows) for states, inputs and parameters (records, arguments).

@@ -4,23 +4,27 @@ What an FMU does when it is loaded, nobody knows before: it may crash, hang, or 
 process loads one before a child has tried it; that it passed is kept in the cache, by the digest of the archive.
 """
 
+import contextlib
 import hashlib
 import json
+import math
 import os
 import pickle
+import selectors
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from otolith.fmu.archive import no_room, store_of
 from otolith.fmu.reference import FmuReference
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.outside_text import visible
-from otolith_drivers.user_dirs import cache_directory
 
 # Decisions; docs/reference/thresholds-twin.md gives the origin of each and the test that guards it.
 TIMEOUT = 60.0  # s of the trial, with the start of the process
@@ -29,6 +33,8 @@ LATER = 7.3  # s: another time, at which rates must be the same
 REPEATED = 1e-9  # relative difference up to which two results are the same
 SLOPE_ERROR = 1e-3  # of the largest slope of a row: a directional derivative may differ so much from a difference
 EVALUATIONS = 200  # that are timed
+MAX_ANSWER = 1_000_000  # bytes of the result; each state may be the rate of another one
+CHECKED = 0.01  # s: how often it is asked whether the process has ended
 MODULE = "otolith.fmu.trial"
 
 
@@ -43,22 +49,45 @@ def try_fmu(reference: FmuReference) -> FmuTrial:
     """Return what a child process found of an FMU; it is tried if that was not done on this computer before.
 
     Raises:
-        ConfigurationError: the FMU cannot be used; with the reason.
-        ServiceError: the cache cannot be used.
+        ConfigurationError: the FMU cannot be used, or the cache; with the reason.
     """
     identity = hashlib.sha256(repr((reference, _dated())).encode()).hexdigest()[:16]
-    passed = cache_directory("fmus") / f"{reference.digest}.{identity}.tried"
+    store = store_of(reference)
+    passed = store / f"{reference.digest}.{identity}.tried"
     try:
-        return _read(passed.read_bytes())
-    except (OSError, ValueError, KeyError, TypeError):
+        return _read(passed.read_bytes(), reference)
+    except (OSError, ValueError):
         answer = _answer(reference)
-    passed.write_bytes(answer)
-    return _read(answer)
+    try:
+        passed.write_bytes(answer)
+    except OSError as error:
+        raise ConfigurationError(no_room(reference, store, error)) from error
+    return _read(answer, reference)
 
 
-def _read(answer: bytes) -> FmuTrial:
-    content = json.loads(answer)
-    return FmuTrial(float(content["seconds"]), tuple((int(rate), int(state)) for rate, state in content["integrals"]))
+def _read(line: bytes, reference: FmuReference) -> FmuTrial:
+    """Return what a line says; raise ValueError if it is no result for this FMU."""
+    numbers = range(len(reference.states))
+    match _loaded(line):
+        case {"seconds": float(seconds), "integrals": list(pairs)} if 0.0 <= seconds < math.inf:
+            found = tuple(_pair(pair) for pair in pairs)
+            if all(number in numbers for pair in found for number in pair):
+                return FmuTrial(seconds, found)
+    raise ValueError("no result")
+
+
+def _pair(pair: object) -> tuple[int, int]:
+    match pair:
+        case [int(rate), int(state)]:
+            return rate, state
+    raise ValueError("no pair of numbers")
+
+
+def _loaded(line: bytes) -> object:
+    try:
+        return json.loads(line)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def _dated() -> str:
@@ -67,27 +96,92 @@ def _dated() -> str:
 
 
 def _answer(reference: FmuReference) -> bytes:
-    command = [sys.executable, "-m", MODULE]
-    given = pickle.dumps(reference)
+    """Return the line that a new process writes; raise ConfigurationError if it is no result."""
     try:
-        done = subprocess.run(command, input=given, capture_output=True, timeout=TIMEOUT, check=False)  # noqa: S603 - ours
-    except subprocess.TimeoutExpired as error:
+        line, status = _child(pickle.dumps(reference))
+    except TimeoutError as error:
         fault = f"the FMU did not answer within {TIMEOUT:g} s, so the process that tried it was ended"
-        raise ConfigurationError(f"{reference.path}: {fault}") from error
+        raise ConfigurationError(f"{reference.path}: {fault}: it must be mended") from error
     except OSError as error:
-        raise ConfigurationError(f"{reference.path}: cannot be tried: {error.strerror}") from error
+        raise ConfigurationError(f"{reference.path}: cannot be tried: {error.strerror or error}") from error
     try:
-        line = done.stdout.splitlines()[-1]
-        answer = json.loads(line)
-    except (IndexError, ValueError) as error:
-        how = f"exit code {done.returncode}"
-        if done.returncode < 0:
-            how = signal.Signals(-done.returncode).name
-        text = f"the FMU ended the process that tried it ({how}): it must be mended"
-        raise ConfigurationError(f"{reference.path}: {text}") from error
-    if fault := answer.get("fault"):
-        raise ConfigurationError(f"{reference.path}: {visible(str(fault), 500)}")
+        match _loaded(line):
+            case {"fault": str(fault)}:
+                raise ConfigurationError(f"{reference.path}: {visible(fault, 500)}")
+        _read(line, reference)
+    except ValueError as error:
+        text = f"the FMU ended the process that tried it ({_ending(status)})"
+        if line:
+            text = "the process that tried the FMU wrote no result, but something else"
+        raise ConfigurationError(f"{reference.path}: {text}: it must be mended") from error
     return line
+
+
+def _ending(status: int) -> str:
+    """Return how a process ended, by its exit code, which is negative after a signal."""
+    if status >= 0:
+        return f"exit code {status}"
+    try:
+        return signal.Signals(-status).name
+    except ValueError:  # those for real time have no names
+        return f"signal {-status}"
+
+
+def _child(given: bytes) -> tuple[bytes, int]:
+    """Return the line that the process of a trial writes, and its exit code; what it has started is ended with it.
+
+    Raises:
+        TimeoutError: it neither wrote a line nor ended in time.
+        OSError: it cannot be started.
+    """
+    deadline = time.monotonic() + TIMEOUT
+    with tempfile.TemporaryFile() as file:  # a pipe would wait for a process that does not read it
+        file.write(given)
+        file.seek(0)
+        process = subprocess.Popen(  # noqa: S603 - ours
+            [sys.executable, "-m", MODULE],
+            stdin=file,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # without a bound
+            start_new_session=True,
+        )
+    with process:
+        try:
+            line = _line(process, deadline)
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # whose number is not given to another one before it is read
+                os.killpg(process.pid, signal.SIGKILL)
+    return line, process.returncode
+
+
+def _line(process: subprocess.Popen[bytes], deadline: float) -> bytes:
+    """Return the first line that a process writes, at most MAX_ANSWER bytes, or what it wrote until its end.
+
+    Processes that it has started may keep the pipe open after its end.
+    """
+    found, is_open = b"", True
+    with selectors.DefaultSelector() as ready:
+        pipe = ready.register(process.stdout, selectors.EVENT_READ).fd  # type: ignore[arg-type]
+        while b"\n" not in found and len(found) < MAX_ANSWER:
+            has_ended = _has_ended(process)  # before what it wrote last is looked for
+            if is_open and ready.select(0.0 if has_ended else CHECKED):
+                chunk = os.read(pipe, 1 << 16)
+                found, is_open = found + chunk, bool(chunk)
+            elif has_ended:
+                break
+            elif not is_open:
+                time.sleep(CHECKED)
+            if time.monotonic() > deadline:
+                raise TimeoutError
+    return found[:MAX_ANSWER].partition(b"\n")[0]
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a process has ended, whose number stays its own."""
+    try:
+        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    except ChildProcessError:  # this process ignores ends of others
+        return True
 
 
 def main() -> None:
@@ -99,7 +193,7 @@ def main() -> None:
     try:
         answer = _trial(reference)
     except Exception as error:  # noqa: BLE001 - the reason is returned as text
-        answer = {"fault": str(error).removeprefix(f"{reference.path}: ")}
+        answer = {"fault": str(error).removeprefix(f"{reference.path}: ") or type(error).__name__}
     os.write(answers, f"{json.dumps(answer)}\n".encode())
     os._exit(0)  # what an FMU does at the end of its process cannot hold this up
 
@@ -120,7 +214,7 @@ def _trial(reference: FmuReference) -> dict[str, object]:
     _compare(reference, first, instance.rows(start[None])[0], "depends on the time, which no twin may but by inputs")
     instance.set_time(0.0)
     if reference.has_slopes:
-        _check_slopes(instance, moved[None])
+        _check_slopes(instance, moved if np.isfinite(second).all() else start)
     states = np.array([point[: len(reference.states)] for point in (start, moved)])
     equal = np.isclose(np.array([first, second])[:, :, None], states[:, None, :], rtol=REPEATED, atol=0.0)
     for rate, state in reference.integrals:
@@ -141,9 +235,12 @@ def _compare(reference: FmuReference, one: NDArray[np.float64], other: NDArray[n
 
 def _check_slopes(instance: Any, point: NDArray[np.float64]) -> None:
     """Raise ValueError if the directional derivatives of an FMU are not those of its rates."""
-    offered, differences = instance.slopes(point[0]), instance.slopes(point[0], by_differences=True)
-    sizes = np.abs(differences).max(axis=1, keepdims=True)
-    wrong = np.abs(offered - differences) > SLOPE_ERROR * sizes
+    offered, differences = instance.slopes(point), instance.slopes(point, by_differences=True)
+    can_compare = np.isfinite(differences)
+    sizes = np.abs(np.where(can_compare, differences, 0.0)).max(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        is_right = np.abs(offered - differences) <= SLOPE_ERROR * sizes  # not so of NaN
+    wrong = can_compare & ~is_right
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
         names = instance.reference.rows[row].name, instance.reference.arguments[column].name
