@@ -1,5 +1,6 @@
 """What an FMU does to whoever reads, unpacks or tries it: bombs, damage, forged answers, and calls after an error."""
 
+import gc
 import os
 import random
 import re
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from otolith.fmu import calls, trial
+from otolith.fmu import archive, calls, trial
 from otolith.fmu.archive import read_archive, unpacked
 from otolith.fmu.instance import FmuInstance
 from otolith.fmu.reference import FmuQuantity, FmuReference
@@ -348,3 +349,41 @@ def test_after_a_fatal_error_it_is_not_called(tmp_path: Path) -> None:
     not_called(instance, ordinary)
     with raises_saying(RuntimeError, "motor.fmu", "fatal", "mended"):
         instance.rows(ordinary)
+
+
+def test_an_instance_that_nobody_uses_is_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, and not after a fatal error, when nothing of it may be called."""
+    freed: list[int] = []
+    for number, status in enumerate(("fmi2Error", "fmi2Fatal")):
+        folder = tmp_path / status
+        folder.mkdir()
+        instance, ordinary, failing = started(folder, status)
+        monkeypatch.setattr(instance._own, "fmi2FreeInstance", lambda _, number=number: freed.append(number))
+        instance.rows(ordinary)
+        if status == "fmi2Fatal":
+            with pytest.raises(RuntimeError):
+                instance.rows(failing)
+        del instance
+        gc.collect()
+    assert freed == [0]
+
+
+def test_a_folder_in_use_is_not_removed(reference: FmuReference, tmp_path: Path) -> None:
+    instance = FmuInstance(reference)
+    (used,) = (tmp_path / "cache").rglob(reference.digest)
+    os.utime(used, (0, 0))
+    others = [used.with_name(f"{number:064x}") for number in range(archive.KEPT + 3)]
+    left = used.with_name("new-left")
+    for at, folder in enumerate([left, *others]):
+        folder.mkdir()
+        os.utime(folder, (at, at))
+    begun = used.with_name("new-begun")
+    begun.mkdir()
+    archive._remove_old(used.parent, others[-1])
+    assert used.is_dir()
+    assert begun.is_dir()
+    assert [folder.is_dir() for folder in (left, *others)] == [False] * 4 + [True] * archive.KEPT
+    del instance
+    gc.collect()
+    archive._remove_old(used.parent, others[-1])
+    assert not used.exists()

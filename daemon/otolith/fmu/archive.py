@@ -5,6 +5,7 @@ folder of this user alone, by the digest of the archive: a file that was changed
 """
 
 import contextlib
+import fcntl
 import hashlib
 import io
 import os
@@ -13,6 +14,7 @@ import re
 import shutil
 import stat
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -30,7 +32,9 @@ MAX_UNPACKED_BYTES = 1 << 30
 MAX_MEMBERS = 20_000
 MAX_DESCRIPTION_BYTES = 32 << 20
 MAX_RATIO, RATIO_BYTES = 200.0, 16 << 20  # of unpacked to packed bytes, for members above that size
-KEPT = 8  # unpacked archives, the latest
+KEPT = 8  # unpacked archives, the latest; and those in use
+LEFT = 86400.0  # s: age from which on a folder that was not finished is removed
+NEW = "new-"  # begins the names of folders that are not whole
 DESCRIPTION = "modelDescription.xml"
 USED = ("binaries/", "resources/")
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
@@ -195,7 +199,7 @@ def no_room(reference: FmuReference, store: Path, error: OSError) -> str:
 
 def _unpack(content: bytes, folder: Path) -> None:
     """Make a folder of what is used of an archive, at once."""
-    temporary = Path(tempfile.mkdtemp(prefix="new-", dir=folder.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=NEW, dir=folder.parent))
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as opened:
             for member in opened.infolist():
@@ -213,8 +217,34 @@ def _unpack(content: bytes, folder: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def held(folder: Path) -> int:
+    """Return a descriptor by which no process removes a folder until it is closed."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    fcntl.flock(handle, fcntl.LOCK_SH)
+    return handle
+
+
 def _remove_old(store: Path, keep: Path) -> None:
-    folders = sorted((path for path in store.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
-    for folder in folders[:-KEPT]:
-        if folder != keep and not folder.name.startswith("new-"):
-            shutil.rmtree(folder, ignore_errors=True)
+    """Remove what was used long ago and is in no use, and what processes that were killed have left."""
+    dated = list[tuple[float, Path]]()
+    for path in store.iterdir():
+        with contextlib.suppress(OSError):  # another process has removed it
+            if path.is_dir():
+                dated.append((path.stat().st_mtime, path))
+    whole = [path for _, path in sorted(dated) if not path.name.startswith(NEW)]
+    begun = [path for mtime, path in dated if path.name.startswith(NEW) and time.time() - mtime > LEFT]
+    for folder in (*whole[:-KEPT], *begun):
+        if folder != keep:
+            _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # it is in use, or another process has removed it
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            gone = folder.with_name(f"{NEW}{folder.name.removeprefix(NEW)}")
+            folder.rename(gone)  # nobody finds a part of it
+            shutil.rmtree(gone, ignore_errors=True)
+        finally:
+            os.close(handle)

@@ -6,15 +6,18 @@ and parameters anew. Where an instance reports an error, another one replaces it
 
 import ctypes
 import logging
+import os
+import weakref
 from collections.abc import Collection
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from otolith.fmu import calls
-from otolith.fmu.archive import unpacked
+from otolith.fmu.archive import held, unpacked
 from otolith.fmu.reference import FmuReference
 from otolith.fmu.trial import try_fmu
 from otolith_drivers.errors import ConfigurationError
@@ -55,10 +58,14 @@ class FmuInstance:
         self._arguments, self._slopes = np.zeros(width), np.zeros(width * height)
         self._wanted = np.zeros(len(reference.parameters) or 1, dtype=np.uint8)
         try:
-            self._own = _model(reference)
+            folder = unpacked(reference)
+            weakref.finalize(self, os.close, held(folder)).atexit = False
+            self._own = _model(reference, folder)
+            weakref.finalize(self, _free, reference.version, self._own, self._table).atexit = False
             self._fill_table()
             self._begin()
         except Exception as error:  # FMPy raises errors of many types, also of the operating system
+            self._table[calls.INSTANCE] = 0  # it may be in a state in which it must not be freed
             text = visible(str(error) or type(error).__name__, MAX_MESSAGE)
             raise ConfigurationError(f"{reference.path}: the FMU does not start: {text}") from error
 
@@ -165,12 +172,21 @@ class FmuInstance:
 
 @lru_cache(maxsize=8)
 def instance_of(reference: FmuReference) -> FmuInstance:
-    """Return the instance of this process; raises as :func:`try_fmu`, and as :class:`FmuInstance`."""
+    """Return the instance of this process; raises as :func:`try_fmu`, and as :class:`FmuInstance`.
+
+    An instance that is no longer among the latest is freed when no kernel uses it any more.
+    """
     try_fmu(reference)
     return FmuInstance(reference)
 
 
-def _model(reference: FmuReference) -> Any:
+def _free(version: str, own: Any, table: NDArray[np.int64]) -> None:
+    """Free the instance of a model that nobody uses any more, unless nothing of it may be called."""
+    if table[calls.INSTANCE] and table[calls.STATUS] < FATAL:
+        getattr(own, f"fmi{version}FreeInstance")(own.component)
+
+
+def _model(reference: FmuReference, folder: Path) -> Any:
     """Return FMPy's model of the unpacked FMU, not yet instantiated."""
     from fmpy import fmi2, fmi3  # noqa: PLC0415 - an optional library, which only such a twin needs
 
@@ -182,7 +198,7 @@ def _model(reference: FmuReference) -> Any:
     }
     return kinds[reference.version, reference.is_model](
         guid=reference.token,
-        unzipDirectory=str(unpacked(reference)),
+        unzipDirectory=str(folder),
         modelIdentifier=reference.identifier,
         instanceName="twin",
     )
