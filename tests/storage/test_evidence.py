@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -49,6 +50,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.acquisition.series import uncut
 from tests.conftest import EXAMPLES, SIGNALS
+from tests.messages import raises_saying
 from tests.runtime.pools import OneMachine
 from tests.storage.histories import event
 from tests.waiting import PATIENCE, wait_for
@@ -451,6 +453,19 @@ def test_a_damaged_bundle_gives_one_line(bundles: list[Path], folder: Path, faul
     assert str(raised.value).startswith(f"{path}: no evidence that this Otolith can use, or damaged: ")
     assert "\n" not in str(raised.value)
     assert list(folder.iterdir()) == [path]
+
+
+def test_a_packing_that_unpacks_without_a_bound_is_refused(folder: Path) -> None:
+    path, size = folder / "bomb.zip", 3 * evidence.MAX_EVIDENCE_BYTES
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr(EVIDENCE, b"0" * size)
+        archive.writestr(TWIN, b"")
+        archive.getinfo(EVIDENCE).file_size = 100
+    tracemalloc.start()
+    with raises_saying(ConfigurationError, "bomb.zip", EVIDENCE, "deflate"):
+        read_bundle(path)
+    assert tracemalloc.get_traced_memory()[1] < size / 2  # a file is read into a buffer of its largest size
+    tracemalloc.stop()
 
 
 def test_a_forged_twin_is_not_run(bundles: list[Path], folder: Path) -> None:

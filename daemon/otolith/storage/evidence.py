@@ -56,6 +56,7 @@ log = logging.getLogger(__name__)
 
 VERSION = 8  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # that are unpacked by parts
 FMU = "fmu.txt"  # in place of the twin: which FMU has its equations
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
@@ -246,6 +247,8 @@ def _read_bundle(path: Path) -> Bundle:
     archive = zipfile.ZipFile(io.BytesIO(packed))
     if FMU in archive.namelist():
         raise ValueError("its equations are in an FMU, which is a program: a bundle has none")
+    if other := [row.filename for row in archive.infolist() if row.compress_type not in PACKINGS]:
+        raise ValueError(f"{other[0]} is not packed by deflate, as bundles are: other methods unpack without a bound")
     with archive.open(EVIDENCE) as evidence, archive.open(TWIN) as text:
         written = _limited(evidence, MAX_EVIDENCE_BYTES)
         if (count := written.count(b",") + written.count(b"[") + written.count(b"{")) > MAX_VALUES:
