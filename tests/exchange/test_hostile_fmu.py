@@ -209,10 +209,11 @@ def test_processes_that_it_started_end_with_it(
     then, part = ENDS[case]
     answering(CHILD.format(mark=str(mark)) + f"while not os.path.exists({str(mark)!r}): time.sleep(0.01)\n{then}")
     if case == "hang":
-        monkeypatch.setattr(trial, "TIMEOUT", 8.0)
+        monkeypatch.setattr(trial, "TIMEOUT", 4.0)
     with raises_saying(ConfigurationError, "motor.fmu", part):
         try_fmu(reference)
-    wait_for(lambda: not is_running(int(mark.read_text(encoding="ascii"))))
+    if mark.exists():  # a busy computer may have ended it before
+        wait_for(lambda: not is_running(int(mark.read_text(encoding="ascii") or 0)))
 
 
 def is_running(process: int) -> bool:
