@@ -100,6 +100,16 @@ def test_a_damaged_stream_is_refused_when_it_is_unpacked(reference: FmuReference
     assert not list((path.parent / "cache").rglob("*.so"))
 
 
+@pytest.mark.parametrize("name", ["resources/" + "x" * 300, "resources/notes/part"])
+def test_names_that_no_disk_can_have_are_those_of_the_archive(name: str, reference: FmuReference) -> None:
+    path = Path(reference.path)
+    with zipfile.ZipFile(path, "a") as opened:
+        opened.writestr("resources/notes", b"text")
+        opened.writestr(name, b"text")
+    with raises_saying(ConfigurationError, "motor.fmu", "cannot be unpacked", "export it"):
+        unpacked(replace(reference, digest=read_archive(path).digest))
+
+
 def test_whatever_is_damaged_is_no_crash(tmp_path: Path) -> None:
     """Bytes of the headers and of the directory, where sizes and places are."""
     own, path, draw = plain(), tmp_path / "motor.fmu", random.Random(5)  # noqa: S311 - no secret
@@ -138,6 +148,7 @@ ANSWERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "a text as time": ("""print('{"seconds": "1", "integrals": []}')""", ("no result",)),
     "a number as integrals": ("""print('{"seconds": 1.0, "integrals": 4}')""", ("no result",)),
     "no such state": ("""print('{"seconds": 1.0, "integrals": [[0, 99]]}')""", ("no result",)),
+    "truth as a state": ("""print('{"seconds": 1.0, "integrals": [[true, 0]]}')""", ("no result",)),
     "a fault that is no text": ("""print('{"fault": {"a": 1}}')""", ("no result",)),
     "without end": (f"""while True: os.write(1, b"{"x" * 4000}")""", ("no result", "mended")),
     "another signal": ("os.kill(os.getpid(), 40)", ("signal 40", "mended")),

@@ -5,6 +5,7 @@ folder of this user alone, by the digest of the archive: a file that was changed
 """
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import io
@@ -42,6 +43,7 @@ PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of the standard; zipfil
 CHUNK = 1 << 16  # bytes
 DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OverflowError)
 READ_ERRORS = (OSError, NotImplementedError, RuntimeError, ValueError, *DAMAGED)
+BY_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)  # a member is too long, or below another
 
 
 class FmuArchive(NamedTuple):
@@ -175,7 +177,10 @@ def unpacked(reference: FmuReference) -> Path:
         try:
             _unpack(content, folder)
         except OSError as error:
-            raise ConfigurationError(no_room(reference, store, error)) from error
+            if error.errno not in BY_NAMES:
+                raise ConfigurationError(no_room(reference, store, error)) from error
+            fault = f"cannot be unpacked by the names of its members: {error.strerror}: export it with others"
+            raise ConfigurationError(f"{reference.path}: {fault}") from error
         except READ_ERRORS as error:
             raise ConfigurationError(f"{reference.path}: {_reason(error)}") from error
         _remove_old(store, folder)

@@ -78,7 +78,7 @@ def _read(line: bytes, reference: FmuReference) -> FmuTrial:
 
 def _pair(pair: object) -> tuple[int, int]:
     match pair:
-        case [int(rate), int(state)]:
+        case [int(rate), int(state)] if bool not in (type(rate), type(state)):
             return rate, state
     raise ValueError("no pair of numbers")
 
