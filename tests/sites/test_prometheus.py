@@ -19,7 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from otolith.health.limits import Level
 from otolith.health.schema import CostDocument, DriverDocument
-from otolith.site.known import Knowledge
+from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
 from otolith.site.metrics import exposition
 from otolith.site.outlets.runner import OutletStatus
 from otolith.site.outlets.table import OUTLETS
@@ -86,6 +86,22 @@ def test_no_text_ends_a_label_or_a_line() -> None:
     assert {(sample.labels["parameter"], sample.labels["unit"]) for sample in values.samples} == {
         (text, text) for text in texts
     }
+
+
+@pytest.mark.parametrize("number", [10**400, 2**63, -1])
+@pytest.mark.parametrize("place", ["lost", "sequence", "previous"])
+def test_a_number_that_no_float_has_is_refused_and_breaks_no_scrape(number: int, place: str) -> None:
+    knowledge, document = known(), json.loads(report_of("press-1").to_json())
+    own = {"counters": {place: number}} if place == "lost" else {place: number}
+    content = json.dumps(document | own).encode()
+    assert knowledge.take(f"otolith/{SITE}/press-1/report", content, START) is None
+    assert knowledge.refused[RefusedFor.UNREADABLE] == 1
+    assert 'machine="press-0"' in scraped(knowledge)
+
+
+def test_a_machine_has_at_most_so_many_parameters_in_a_scrape() -> None:
+    rows = {f"p{index}": report_of().parameters["R_a"] for index in range(3 * MAX_PARAMETERS)}
+    assert scraped(known(parameters=rows)).count("\notolith_parameter_value{") == MAX_PARAMETERS
 
 
 @pytest.mark.timed

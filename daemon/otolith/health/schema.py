@@ -5,7 +5,7 @@ Every number is finite or absent. What has no content yet is absent.
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
@@ -19,6 +19,9 @@ from otolith_drivers.config_files import DocumentModel
 
 Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
+
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
+"""A number that each database and each number of 64 bits can have: anybody may publish a document."""
 
 
 class FindingKind(StrEnum):
@@ -144,7 +147,7 @@ class NoteDocument(DocumentModel):
 class EvidenceDocument(DocumentModel):
     """What an event rests on."""
 
-    windows: tuple[int, int]  # Index of the first and of the latest window that showed it
+    windows: tuple[Count, Count]  # Index of the first and of the latest window that showed it
     value: float | None = None
     sd: float | None = None
     unit: str = ""
@@ -156,8 +159,8 @@ class EventDocument(DocumentModel):
     """A condition of a part that calls for attention, from the window that raised it to the one that cleared it."""
 
     id: str  # What it is about, and when it began: the same in each of its reports
-    sequence: int | None = None  # Of a change: see ReportDocument.sequence
-    previous: int | None = None  # Of a change: the sequence number of the change of an event before it
+    sequence: Count | None = None  # Of a change: see ReportDocument.sequence
+    previous: Count | None = None  # Of a change: the sequence number of the change of an event before it
     part: str
     state: Level
     change: EventChange | None = None  # None if this window changed nothing
@@ -243,10 +246,10 @@ class QualityDocument(DocumentModel):
 class WindowDocument(DocumentModel):
     """The window; start and end in Unix seconds."""
 
-    index: int
+    index: Count
     start: float
     end: float
-    records: int
+    records: Count
     quality: QualityDocument
     observed: dict[str, float] | None = None  # Mean of each observed signal, as a temperature in K
     absent: dict[str, str] | None = None  # Of several sources, those that are down or gave no sample: in words, by name
@@ -337,8 +340,8 @@ class CostDocument(DocumentModel):
 
     seconds: float | None = None  # Computing time, s; None in a replay, unless it was asked for
     latency_s: float | None = None  # From the end of the window to the publication of this report; None in a replay
-    evaluations: int = 0
-    generations: int = 0
+    evaluations: Count = 0
+    generations: Count = 0
     searched: bool = False  # Whether hypotheses were compared: components, moved parameters, faulty sensors
 
 
@@ -349,10 +352,10 @@ class SourceDocument(DocumentModel):
     up: bool
     reason: str = ""  # Why it is down
     warnings: tuple[str, ...] = ()  # What is wrong although it is up, a line each
-    received: int = 0  # Samples
-    bad: int = 0  # Received frames, replies or values that could not be used
-    lost: int = 0  # Samples that were sent or requested and did not arrive
-    reconnects: int = 0
+    received: Count = 0  # Samples
+    bad: Count = 0  # Received frames, replies or values that could not be used
+    lost: Count = 0  # Samples that were sent or requested and did not arrive
+    reconnects: Count = 0
 
 
 class DriverDocument(DocumentModel):
@@ -368,27 +371,27 @@ class DriverDocument(DocumentModel):
 class CountersDocument(DocumentModel):
     """What was received and lost since the daemon started."""
 
-    received: int = 0  # Samples
-    bad: int = 0  # Received frames, replies or values that could not be used
-    lost: int = 0  # Samples that were sent or requested and did not arrive, or that overflowed a buffer
-    reconnects: int = 0
-    windows: int = 0  # Windows formed
-    windows_bad: int = 0  # Windows not estimated from because of their quality
-    windows_missed: int = 0  # Windows not estimated from because the worker was down or busy
-    worker_restarts: int = 0
-    recordings_dropped: int = 0  # Windows that the recorder did not accept in time, or lost when it ended
-    recorder_restarts: int = 0
-    history_dropped: int = 0  # Windows that the history did not take: its disk was full or too slow
-    evidence_dropped: int = 0  # Changes of events of which no evidence could be kept
-    commands_failed: int = 0  # Events for which on_event failed
+    received: Count = 0  # Samples
+    bad: Count = 0  # Received frames, replies or values that could not be used
+    lost: Count = 0  # Samples that were sent or requested and did not arrive, or that overflowed a buffer
+    reconnects: Count = 0
+    windows: Count = 0  # Windows formed
+    windows_bad: Count = 0  # Windows not estimated from because of their quality
+    windows_missed: Count = 0  # Windows not estimated from because the worker was down or busy
+    worker_restarts: Count = 0
+    recordings_dropped: Count = 0  # Windows that the recorder did not accept in time, or lost when it ended
+    recorder_restarts: Count = 0
+    history_dropped: Count = 0  # Windows that the history did not take: its disk was full or too slow
+    evidence_dropped: Count = 0  # Changes of events of which no evidence could be kept
+    commands_failed: Count = 0  # Events for which on_event failed
 
 
 class ReportDocument(DocumentModel):
     """The report of one window."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA
-    sequence: int | None = None  # Rises from message to message of a machine, also after a restart; None in a replay
-    previous: int | None = None  # Sequence number of the report before it; None for the first one
+    sequence: Count | None = None  # Rises from message to message of a machine, also after a restart; None in a replay
+    previous: Count | None = None  # Sequence number of the report before it; None for the first one
     machine: str
     site: str
     twin: str

@@ -21,6 +21,7 @@ MAX_MACHINES = 400
 MAX_BYTES = 256 << 10  # of a document
 MAX_TOTAL_BYTES = 32 << 20  # of all latest reports
 MAX_EVENTS = 50  # of a machine: the last ones
+MAX_PARAMETERS = 64  # of a machine that are passed on
 MAX_TRENDS = 16  # parameters of a machine of which a curve is kept
 MAX_POINTS = 48  # of a curve
 MAX_PAUSE = 1800.0  # s between two points of a curve

@@ -2,13 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from otolith.health.limits import LEVELS, Level
 from otolith.health.schema import CountersDocument, ReportDocument
-from otolith.site.known import Knowledge, KnownMachine, RefusedFor
+from otolith.site.known import MAX_PARAMETERS, Knowledge, KnownMachine, RefusedFor
 from otolith.site.outlets.runner import OutletStatus
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -109,7 +110,7 @@ def _gauge(name: str, help_text: str, rows: Iterable[tuple[tuple[str, ...], floa
 
 def _parameters(speaking: Iterable[tuple[KnownMachine, ReportDocument]]) -> Iterator[Metric]:
     rows = [((*_own(machine), name, row.unit), row)
-            for machine, report in speaking for name, row in report.parameters.items()]  # fmt: skip
+            for machine, report in speaking for name, row in islice(report.parameters.items(), MAX_PARAMETERS)]  # fmt: skip
     for key, help_text in VALUES.items():
         metric = GaugeMetricFamily(f"otolith_parameter_{key}", help_text, labels=PARAMETER)
         for labels, row in rows:

@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from itertools import islice
 from typing import Any
 
 from paho.mqtt import client as mqtt
@@ -15,6 +16,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from otolith import __version__
 from otolith.health.schema import ParameterDocument
 from otolith.site.hall import SHOWN
+from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
 from otolith.site.outlets.connections import failure, tls_context
 from otolith.site.outlets.options import MqttOutlet
@@ -27,7 +29,6 @@ CONNECT_TIMEOUT = 3.0  # s for the network connection
 ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client, and its messages
 CLOSING = 1.0  # s for the last message
 KEEPALIVE = 15  # s without a message after which the broker is asked whether it is there
-MAX_DISCOVERED = 64  # parameters of a machine
 ONLINE, OFFLINE = "online", "offline"
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template of Home Assistant may have as they are
 
@@ -121,7 +122,8 @@ class MqttPublisher:
         yield state, {"site": view.site, "machine": view.name, "state": str(view.state), "word": view.word,
                       "since": since, "what": view.what, "advice": view.advice}  # fmt: skip
         if view.report is not None:
-            rows = {visible(name): _row(row) for name, row in view.report.parameters.items()}
+            first = islice(view.report.parameters.items(), MAX_PARAMETERS)
+            rows = {visible(name): _row(row) for name, row in first}
             yield parameters, {"time": _iso(view.report.window.end), "parameters": rows}
         yield availability, OFFLINE if view.report is None else ONLINE
 
@@ -129,8 +131,8 @@ class MqttPublisher:
         """Yield the configurations of its sensors, as Home Assistant documents them, if they are new."""
         if self._options.discovery is None or view.report is None:
             return
-        rows = {name: row.unit for name, row in view.report.parameters.items() if IDENTIFIER.fullmatch(name)}
-        own = frozenset(list(rows.items())[:MAX_DISCOVERED])
+        first = islice(view.report.parameters.items(), MAX_PARAMETERS)
+        own = frozenset((name, row.unit) for name, row in first if IDENTIFIER.fullmatch(name))
         if self._discovered.get(view.key) == own:
             return
         self._discovered[view.key] = own

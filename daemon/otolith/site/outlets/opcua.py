@@ -20,6 +20,7 @@ from asyncua.crypto.permission_rules import User, UserRole
 from otolith.health.limits import Level
 from otolith.health.schema import ParameterDocument, ReportDocument, Status
 from otolith.health.text import texts_in
+from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.connections import failure
 from otolith.site.outlets.options import OpcuaOutlet
@@ -29,7 +30,6 @@ from otolith_drivers.outside_text import visible
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 START_TIMEOUT = 30.0  # s to load the standard address space
 UPDATE_TIMEOUT = 10.0  # s for what has changed
-MAX_PARAMETERS = 64  # of a machine
 MAX_NAME = 100  # characters of the name of a node
 SEVERITIES = {Level.WATCH: 500, Level.ACT: 800}  # Of OPC UA: 1 to 1000
 CALM = 100  # Severity of an alarm that is over
