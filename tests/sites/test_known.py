@@ -13,6 +13,8 @@ from otolith.site.known import (
     ESTABLISHED,
     FORGET_AFTER,
     MAX_BYTES,
+    MAX_EVENT_ID,
+    MAX_EVENT_TEXT,
     MAX_EVENTS,
     MAX_MACHINES,
     MAX_POINTS,
@@ -226,6 +228,36 @@ def test_a_curve_and_the_events_of_a_machine_are_bounded() -> None:
     many = {f"p{index}": report_of().parameters["R_a"] for index in range(3 * MAX_TRENDS)}
     take(knowledge, report_of(number=500, end=START + 900.0).model_copy(update={"parameters": many}))
     assert len(machine.trends) == MAX_TRENDS
+
+
+def test_the_texts_of_events_do_not_fill_the_memory() -> None:
+    """Nobody writes an id of such a length, and of a long text its begin says what it is about."""
+    knowledge = Knowledge()
+    texts = ("part", "condition", "condition_id", "text", "cause", "advice", "setting", "formulas", "source", "reason")
+    note = {"by": "x" * 5000, "at": START, "text": "x" * 5000}
+    content = json.loads(raised().model_dump_json(exclude_none=True)) | dict.fromkeys(texts, "x" * 5000)
+    content |= {"acknowledged": note, "comments": [note] * 9}
+    key = f"otolith/{SITE}/{MACHINE}/event"
+    assert knowledge.take(key, json.dumps(content).encode(), START) is not None
+    (event,) = only(knowledge).events.values()
+    assert event.text == "x" * MAX_EVENT_TEXT
+    assert len(event.model_dump_json()) < 8 * MAX_EVENT_TEXT
+    content["id"] = "x" * (MAX_EVENT_ID + 1)
+    assert knowledge.take(key, json.dumps(content).encode(), START) is None
+    report = report_of(number=2, events=(raised().model_copy(update={"id": content["id"]}),))
+    assert take(knowledge, report) is None
+    assert knowledge.refused == {RefusedFor.TOO_LARGE: 2}
+
+
+def test_of_too_many_events_those_that_are_over_go_first() -> None:
+    knowledge = Knowledge()
+    first = raised(time=START).model_copy(update={"id": "open", "start": START})
+    for index in range(2 * MAX_EVENTS):
+        time = START + 1.0 + index
+        over = raised(time=time).model_copy(update={"id": f"over@{index}", "start": time, "end": time})
+        take(knowledge, report_of(number=index + 1, end=time, events=(first, over)))
+    assert len(only(knowledge).events) == MAX_EVENTS
+    assert only(knowledge).events["open"].end is None
 
 
 @given(st.lists(st.floats(0.1, 4000.0), min_size=1, max_size=400))

@@ -21,6 +21,8 @@ MAX_MACHINES = 400
 MAX_BYTES = 256 << 10  # of a document
 MAX_TOTAL_BYTES = 32 << 20  # of all latest reports
 MAX_EVENTS = 50  # of a machine: the last ones
+MAX_EVENT_ID = 200  # characters
+MAX_EVENT_TEXT = 4000  # characters of each text of an event that is kept
 MAX_PARAMETERS = 64  # of a machine that are passed on
 MAX_TRENDS = 16  # parameters of a machine of which a curve is kept
 MAX_POINTS = 48  # of a curve
@@ -34,10 +36,15 @@ RIVALS = 2  # times that a lower number followed within RIVAL_SPAN, from which t
 RIVAL_SPAN = 600.0  # s
 
 
+NOT_SHOWN = {"setting": "", "formulas": "", "source": "", "reason": None, "comments": None}
+"""What of an event no page and no outlet has, and is not kept."""
+TEXTS = ("part", "condition", "condition_id", "text", "cause", "advice", "timezone")
+
+
 class RefusedFor(StrEnum):
     """Why a document was not taken."""
 
-    TOO_LARGE = "too_large"
+    TOO_LARGE = "too_large"  # Or the id of an event is
     UNREADABLE = "unreadable"  # No document of a version that is known here
     OTHER_NAME = "other_name"  # Of another machine than its key
     NUMBER = "number"  # A report with a lower number than the last one, and none before it in its order
@@ -228,6 +235,8 @@ class Knowledge:
         report = ReportDocument.model_validate_json(text, extra="ignore")  # a later version may write more
         if (report.site, report.machine) != (site, name):
             return RefusedFor.OTHER_NAME
+        if any(len(event.id) > MAX_EVENT_ID for event in report.events):
+            return RefusedFor.TOO_LARGE
         known, heard = self.get(site, name), min(now, report.window.end) if is_past else now
         if known is not None and (step := _step(known, report)) is not None and step <= 0:
             if step == 0 or is_past:
@@ -251,6 +260,8 @@ class Knowledge:
 
     def _take_event(self, site: str, name: str, content: bytes, now: float) -> KnownMachine | RefusedFor:
         event = EventDocument.model_validate_json(content, extra="ignore")
+        if len(event.id) > MAX_EVENT_ID:
+            return RefusedFor.TOO_LARGE
         machine = self._machine(site, name, now)
         if machine is None:
             return RefusedFor.TOO_MANY
@@ -285,13 +296,23 @@ def _follow(machine: KnownMachine, report: ReportDocument) -> None:
 
 
 def _keep(machine: KnownMachine, event: EventDocument) -> None:
-    """Keep an event, unless a later change of it is known; of too many, drop the oldest."""
+    """Keep an event, unless a later change of it is known; of too many, drop the oldest, those that are over first."""
     known = machine.events.get(event.id)
     if known and known.sequence is not None and event.sequence is not None and event.sequence < known.sequence:
         return
-    machine.events[event.id] = event
-    while len(machine.events) > MAX_EVENTS:
-        del machine.events[min(machine.events, key=lambda key: machine.events[key].start)]
+    events = machine.events
+    events[event.id] = _shortened(event)
+    while len(events) > MAX_EVENTS:
+        del events[min(events, key=lambda key: (events[key].end is None, events[key].start))]
+
+
+def _shortened(event: EventDocument) -> EventDocument:
+    """Return what is kept of an event, so that the events of all machines have room."""
+    notes = {name: note.model_copy(update={"by": note.by[:MAX_EVENT_ID], "text": note.text[:MAX_EVENT_TEXT]})
+             for name in ("acknowledged", "shelved") if (note := getattr(event, name)) is not None}  # fmt: skip
+    texts = {name: text[:MAX_EVENT_TEXT] for name in TEXTS if (text := getattr(event, name))}
+    evidence = event.evidence.model_copy(update={"unit": event.evidence.unit[:MAX_EVENT_ID]})
+    return event.model_copy(update={**NOT_SHOWN, **texts, **notes, "evidence": evidence})
 
 
 def _identity(key: str) -> tuple[str, str, str] | None:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from otolith.health.limits import Level
 from otolith.site.known import Knowledge
 from otolith.site.outlets import mail
+from otolith.site.outlets import notices as notices_module
 from otolith.site.outlets.base import Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.notices import HOUR, MISSED, Notices, RateLimit
 from otolith.site.outlets.options import MailOutlet, WebhookOutlet
@@ -59,6 +60,19 @@ def test_what_changed_shortly_before_the_start_is_told(age: float, count: int) -
     event = raised(time=START).model_copy(update={"since": START - age})
     knowledge.take(*sent(report_of(events=(event,))), START)
     assert len(Notices(START).take(knowledge)) == count
+
+
+def test_an_event_that_is_open_is_told_once_however_many_others_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notices_module, "MAX_REMEMBERED", 60)
+    knowledge, notices, told = Knowledge(), Notices(START), list[str]()
+    first = raised(time=START).model_copy(update={"id": "open"})
+    for index in range(200):
+        now = START + 1.0 + index
+        other = raised(time=now).model_copy(update={"id": f"other@{index}", "start": now, "end": None})
+        knowledge.take(*sent(report_of(number=index + 1, end=now, events=(first, other))), now)
+        told += [each.event.id for each in notices.take(knowledge) if each.told is Told.RAISED]
+    assert len(told) == len(set(told)) == 201
+    assert len(notices._told) <= 60
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 2000.0), st.integers(0, 8)), max_size=60), st.integers(1, 20))

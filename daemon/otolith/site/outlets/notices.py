@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from itertools import islice
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument
@@ -10,7 +11,7 @@ from otolith.site.outlets.base import Notice, Told
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MISSED = 600.0  # s before the start of the site: changes of that time are told, too
-MAX_REMEMBERED = 20_000  # events
+MAX_REMEMBERED = 20_000  # events; those that a machine still has are among them
 HOUR = 3600.0  # s
 
 
@@ -23,15 +24,18 @@ class Notices:
 
     def take(self, machines: Iterable[KnownMachine]) -> list[Notice]:
         """Return what has not been told, the oldest first."""
-        found = sorted(self._of(machines), key=lambda notice: notice.event.end or notice.event.since)
-        while len(self._told) > MAX_REMEMBERED:
-            del self._told[next(iter(self._told))]
+        own = tuple(machines)
+        found = sorted(self._of(own), key=lambda notice: notice.event.end or notice.event.since)
+        if (excess := len(self._told) - MAX_REMEMBERED) > 0:
+            known = {_key(machine, event) for machine in own for event in machine.events.values()}
+            for key in list(islice((key for key in self._told if key not in known), excess)):
+                del self._told[key]
         return found
 
     def _of(self, machines: Iterable[KnownMachine]) -> Iterator[Notice]:
         for machine in machines:
             for event in machine.events.values():
-                key = (machine.site, machine.name, event.id)
+                key = _key(machine, event)
                 state = None if event.end is not None else event.state
                 is_new, before = key not in self._told, self._told.get(key)
                 if not is_new and before is state:
@@ -42,6 +46,10 @@ class Notices:
                 told = _told(before, state, is_new=is_new)
                 if told is not None and (not is_new or _changed(event) >= self._from):
                     yield Notice(machine.site, machine.name, told, event)
+
+
+def _key(machine: KnownMachine, event: EventDocument) -> tuple[str, str, str]:
+    return machine.site, machine.name, event.id
 
 
 def _changed(event: EventDocument) -> float:
