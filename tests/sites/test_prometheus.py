@@ -37,7 +37,7 @@ PROMETHEUS, PROMTOOL, AMTOOL = (shutil.which(name) for name in ("prometheus", "p
 
 
 def scraped(knowledge: Knowledge, now: float = START) -> str:
-    return exposition(knowledge, {"queue": 1}, [OutletStatus("mqtt")], now).decode()
+    return exposition(knowledge, {"queue": 1}, [OutletStatus("mqtt", is_tried=True)], now).decode()
 
 
 def known(count: int = 1, **update: Any) -> Knowledge:

@@ -89,9 +89,10 @@ def _outlets(outlets: Iterable[OutletStatus]) -> Iterator[Metric]:
     up = GaugeMetricFamily("otolith_outlet_up", "Whether the last try of an outlet succeeded.", labels=("outlet",))
     rows = {name: CounterMetricFamily(f"otolith_outlet_{name}", text, labels=("outlet",)) for name, text in (
         ("failures", "Tries of an outlet that failed."), ("sent", "Notices of events that an outlet passed on."),
-        ("lost", "Notices that an outlet dropped: above its limit per hour, or after a long failure."))}  # fmt: skip
+        ("lost", "Notices that were dropped: above the limit per hour, after a failure, or refused."))}  # fmt: skip
     for outlet in outlets:
-        up.add_metric((outlet.name,), float(outlet.is_up))
+        if outlet.is_tried:
+            up.add_metric((outlet.name,), float(outlet.is_up))
         for name, metric in rows.items():
             metric.add_metric((outlet.name,), float(getattr(outlet, name)))
     yield from (up, *rows.values())
@@ -110,7 +111,8 @@ def _gauge(name: str, help_text: str, rows: Iterable[tuple[tuple[str, ...], floa
 
 def _parameters(speaking: Iterable[tuple[KnownMachine, ReportDocument]]) -> Iterator[Metric]:
     rows = [((*_own(machine), name, row.unit), row)
-            for machine, report in speaking for name, row in islice(report.parameters.items(), MAX_PARAMETERS)]  # fmt: skip
+            for machine, report in speaking
+            for name, row in islice(report.parameters.items(), MAX_PARAMETERS)]  # fmt: skip
     for key, help_text in VALUES.items():
         metric = GaugeMetricFamily(f"otolith_parameter_{key}", help_text, labels=PARAMETER)
         for labels, row in rows:

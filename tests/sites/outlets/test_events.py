@@ -24,7 +24,7 @@ from otolith.site.outlets.notices import HOUR, MISSED, Notices, RateLimit
 from otolith.site.outlets.options import MailOutlet, WebhookOutlet
 from otolith.site.outlets.webhook import build as webhook
 from tests.hostile import hostile_text
-from tests.messages import raises_saying
+from tests.messages import assert_says
 from tests.sites.machines import raised, report_of, sent
 from tests.sites.outlets.rigs import MailRig, WebhookRig
 from tests.storage.histories import START
@@ -135,9 +135,11 @@ def test_what_is_refused_for_good_is_dropped_and_the_rest_tried_again(
     handler = "tests.sites.outlets.rigs._Posted.send_response"
     monkeypatch.setattr(handler, answer)
     waiting = deque([notice("a"), notice("b")])
-    with raises_saying(OutletError, "127.0.0.1", str(status)):
+    with pytest.raises(OutletError) as caught:
         hook(posted).send([], [], waiting)
+    assert_says(str(caught.value), "127.0.0.1", str(status))
     assert len(waiting) == left
+    assert caught.value.refused == 2 - left
     assert len(posted.received) == (1 if left else 2)  # no redirection is followed
 
 
@@ -181,6 +183,7 @@ def test_no_text_adds_a_header_or_a_line(text: str) -> None:
     message = mail.Mail(options, "", TLS, OutletSetup(Path(), text, "en"))._message([own])
     assert len(message.items()) == len({name for name, _ in message.items()}) == 9
     assert len(message.get_content().splitlines()) <= 5
+    assert max(map(len, message.get_content().splitlines())) <= mail.MAX_LINE
     assert message.as_bytes()
 
 
@@ -192,6 +195,7 @@ def test_what_a_server_refuses_for_good_is_dropped(mailbox: MailRig, monkeypatch
             raise smtplib.SMTPDataError(code, b"no")
 
         monkeypatch.setattr(smtplib.SMTP, "send_message", refuse)
-        with pytest.raises(OutletError):
+        with pytest.raises(OutletError) as caught:
             mailing(mailbox).send([], [], waiting)
         assert len(waiting) == left
+        assert caught.value.refused == 1 - left

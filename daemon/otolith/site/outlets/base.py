@@ -14,7 +14,12 @@ SCHEMA = "otolith.notice/1"
 
 
 class OutletError(Exception):
-    """What an outlet could not pass on, and why; it is tried again."""
+    """What an outlet could not pass on, and why; it is tried again, but for notices that were refused for good."""
+
+    def __init__(self, reason: str, refused: int = 0) -> None:
+        """``refused`` says how many of the notices that were removed the receiver will not take."""
+        super().__init__(reason)
+        self.refused = refused
 
 
 class Told(StrEnum):
@@ -75,10 +80,11 @@ class Notice:
 class Outlet(Protocol):
     """Passes on what is known, in a thread of its own; it may block for some seconds."""
 
-    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Pass on machines that have changed, those that are ``gone``, and notices, each of which it then removes.
 
-        After an error, and at first, ``views`` has all machines.
+        After an error, and at first, ``views`` has all machines. Return whether the other side was reached: an outlet
+        of notices has nothing to try without one.
 
         Raises:
             OutletError: something could not be passed on.

@@ -20,6 +20,7 @@ from otolith_drivers.outside_text import visible
 ANSWER_TIMEOUT = 10.0  # s
 MAX_TOGETHER = 50  # notices in one e-mail
 MAX_SUBJECT = 120  # characters
+MAX_LINE = 1000  # characters of a text
 LASTING = 500  # Statuses of SMTP from which the same e-mail is not sent again
 
 
@@ -29,17 +30,20 @@ class Mail:
     def __init__(self, options: MailOutlet, secret: str, tls: ssl.SSLContext, setup: OutletSetup) -> None:
         self._options, self._secret, self._tls, self._setup = options, secret, tls, setup
 
-    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Send the notices together; see :class:`otolith.site.outlets.base.Outlet`."""
+        is_tried = bool(notices)
         while notices:
             own = list(notices)[:MAX_TOGETHER]
             try:
                 self._send(self._message(own))
             except (OSError, smtplib.SMTPException) as error:
-                if _is_lasting(error):
+                is_lasting = _is_lasting(error)
+                if is_lasting:
                     _remove(notices, len(own))
-                raise OutletError(failure(error, self._options.host)) from error
+                raise OutletError(failure(error, self._options.host), len(own) if is_lasting else 0) from error
             _remove(notices, len(own))
+        return is_tried
 
     def close(self) -> None:
         """Nothing is open."""
@@ -68,7 +72,7 @@ class Mail:
         what = f"{words['what_to_do']}: {event.advice}"
         is_open = notice.told is not Told.CLEARED and event.advice
         own = (self._title(notice), f"{notice.site}, {at}", event.text, *((what,) if is_open else ()))
-        return [visible(line) for line in own]
+        return [_short(visible(line)) for line in own]
 
     def _send(self, message: EmailMessage) -> None:
         options = self._options
@@ -84,6 +88,10 @@ class Mail:
             if options.user is not None:
                 client.login(options.user, self._secret)
             client.send_message(message)
+
+
+def _short(line: str) -> str:
+    return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 1]}…"
 
 
 def _remove(notices: deque[Notice], count: int) -> None:

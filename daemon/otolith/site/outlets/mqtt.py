@@ -45,7 +45,7 @@ class MqttPublisher:
     def _availability(self) -> str:
         return f"{self._options.prefix}/status"
 
-    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Publish what has changed; see :class:`otolith.site.outlets.base.Outlet`."""
         client = self._connected()
         last: mqtt.MQTTMessageInfo | None = None
@@ -67,6 +67,7 @@ class MqttPublisher:
             self.close()
             raise OutletError(failure(error, self._options.host)) from error
         notices.clear()
+        return True
 
     def close(self) -> None:
         """Say that the site is away, and end the connection."""

@@ -78,7 +78,7 @@ class OpcuaServer:
         self._machines: dict[str, _MachineNodes] = {}
         self._alarm: Any = None
 
-    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Write what has changed, and trigger events; see :class:`otolith.site.outlets.base.Outlet`."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._loop.run_forever, name="opcua-server", daemon=True)
@@ -89,6 +89,7 @@ class OpcuaServer:
             self._wait(self._update(views, gone, notices), UPDATE_TIMEOUT)
         except (OSError, TimeoutError, ua.UaError) as error:
             raise OutletError(failure(error, self._options.listen)) from error
+        return True
 
     def close(self) -> None:
         """End the server."""

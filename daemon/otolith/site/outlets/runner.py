@@ -28,11 +28,12 @@ class OutletStatus:
     """How an outlet does, for metrics and for the log."""
 
     name: str
-    is_up: bool = False
+    is_up: bool = False  # Whether the last try succeeded
+    is_tried: bool = False
     reason: str = "not tried yet"
     failures: int = 0
     sent: int = 0  # Notices
-    lost: int = 0  # Notices that were dropped, because of the limit per hour or because it failed for too long
+    lost: int = 0  # Notices that were dropped, because of the limit per hour, after a long failure, or refused for good
     since: float = field(default_factory=time.time)
 
 
@@ -63,16 +64,18 @@ class OutletRunner:
         pause = TICK  # s
         while not self._stopping.wait(pause):
             try:
-                self._pass_on()
+                is_tried = self._pass_on()
             except OutletError as error:
                 self._fail(str(error))
             except Exception:  # what machines publish ends no outlet
                 log.exception("%s: a fault of its own", self.status.name)
                 self._fail("a fault of its own, see the log")
             else:
-                if not self.status.is_up:
+                if is_tried and not self.status.is_up:
                     log.info("%s: works", self.status.name)
-                self.status.is_up, self.status.reason, pause = True, "", TICK
+                if is_tried:
+                    self.status.is_tried, self.status.is_up, self.status.reason = True, True, ""
+                pause = TICK
                 continue
             pause = min(2.0 * pause, MAX_PAUSE) if pause > TICK else 2.0 * FIRST_PAUSE
         self._outlet.close()
@@ -80,11 +83,12 @@ class OutletRunner:
     def _fail(self, reason: str) -> None:
         if self.status.is_up or reason != self.status.reason:
             log.warning("%s: %s", self.status.name, reason)
-        self.status.is_up, self.status.reason = False, reason
+        self.status.is_tried, self.status.is_up, self.status.reason = True, False, reason
         self.status.failures += 1
-        self._shown.clear()
+        self._shown = dict.fromkeys(self._shown, ())  # all are shown again, and those that are gone are known
 
-    def _pass_on(self) -> None:
+    def _pass_on(self) -> bool:
+        """Pass on what has changed; return whether the other side was reached."""
         now = time.time()
         with self._collector.lock:
             machines = list(self._collector.knowledge)
@@ -94,17 +98,23 @@ class OutletRunner:
         while len(self._pending) > MAX_PENDING:
             self._pending.popleft()
             self._dropped += 1
-        self.status.lost = self._dropped + self._limit.withheld
+        self.status.lost, refused = self._dropped + self._limit.withheld, 0
         waiting = len(self._pending)
         known = {f"{machine.site}/{machine.name}" for machine in machines}
         gone = [key for key in self._shown if key not in known]
         try:
-            self._outlet.send(changed, gone, self._pending)
+            is_tried = self._outlet.send(changed, gone, self._pending)
+        except OutletError as error:
+            refused = error.refused
+            raise
         finally:
-            self.status.sent += waiting - len(self._pending)
+            self._dropped += refused
+            self.status.lost += refused
+            self.status.sent += waiting - len(self._pending) - refused
         for key in gone:
             del self._shown[key]
         self._shown |= {view.key: view.revision for view in changed}
+        return is_tried
 
     def _view(self, machine: KnownMachine, now: float) -> MachineView | None:
         """Return a machine, None if it was passed on as it is."""

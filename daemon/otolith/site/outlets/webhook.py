@@ -28,18 +28,25 @@ class Webhook:
         self._address, self._secret, self._tls = urlsplit(options.url), secret, tls
         self._path = self._address._replace(scheme="", netloc="", fragment="").geturl() or "/"
 
-    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
+    def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Send each notice; see :class:`otolith.site.outlets.base.Outlet`."""
         refused: list[int] = []
+        is_tried = bool(notices)
         while notices:
-            status = self._post(notices[0])
+            try:
+                status = self._post(notices[0])
+            except OutletError as error:
+                error.refused = len(refused)
+                raise
             if not 200 <= status < 300:
                 if status not in REFUSED:
-                    raise OutletError(f"{self._address.hostname}: answers with status {status}")
+                    raise OutletError(f"{self._address.hostname}: answers with status {status}", len(refused))
                 refused.append(status)
             notices.popleft()
         if refused:
-            raise OutletError(f"{self._address.hostname}: refuses notices with status {refused[-1]}: is url right?")
+            reason = f"refuses notices with status {refused[-1]}: is url right?"
+            raise OutletError(f"{self._address.hostname}: {reason}", len(refused))
+        return is_tried
 
     def close(self) -> None:
         """Nothing is open."""
