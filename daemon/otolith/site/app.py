@@ -173,7 +173,7 @@ class SitePages:
             async with self._looking:
                 history = await run_in_threadpool(past_of, self._collector.ask, query, report)
                 page = await run_in_threadpool(received_page, history, query.since, now)
-        except ValueError:  # anybody may have published it
+        except (ValueError, LookupError, ArithmeticError, OSError):  # anybody may have published it
             return self._message(language, "unreadable", 502)
         head = PAGES.get_template("spans.html").render(
             site=site, machine=name, spans=SPANS, span=span if span in SPANS else "1h", **self._frame(language)

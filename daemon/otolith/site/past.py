@@ -1,11 +1,13 @@
 """The past of a machine, from the history of its daemon over Zenoh: few reports, spread over the time asked for."""
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from otolith.health.schema import EventDocument, ReportDocument
+from otolith.publishing.reader_sessions import QUERY_TIMEOUT
 from otolith.publishing.received_history import ReceivedHistory
 from otolith.publishing.zenoh_session import EVENT, REPORT
 from otolith.site.known import MAX_BYTES
@@ -15,6 +17,8 @@ POINTS = 96  # reports of a page, at most
 MAX_EVENTS = 500  # of a page
 PARALLEL = 6  # queries of one page at a time
 SPANS = {"1h": 3600.0, "8h": 28_800.0, "24h": 86_400.0, "7d": 604_800.0}  # s, by the name that an address gives
+DEADLINE = 10.0  # s for all queries of a page
+TIMED_OUT = 0.9 * QUERY_TIMEOUT  # s of a query after which its daemon is not asked again
 MIN_WINDOW = 2.0  # s: the shortest span of one query
 
 Ask = Callable[[str, int], list[bytes]]
@@ -31,9 +35,24 @@ class PastQuery:
     window: float  # Length of a window, s
 
 
+class _Asking:
+    """Asks until a query times out, or there is no time for another one: what is missing is not on the page."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask, self._until = ask, time.monotonic() + DEADLINE - QUERY_TIMEOUT
+
+    def __call__(self, selector: str, limit: int) -> list[bytes]:
+        if (begun := time.monotonic()) > self._until:
+            return []
+        found = self._ask(selector, limit)
+        if time.monotonic() - begun >= TIMED_OUT:
+            self._until = begun
+        return found
+
+
 def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> ReceivedHistory:
     """Return the history of a machine; ``ask`` returns what daemons answer to a selector, with a limit."""
-    pieces = tuple(_pieces(query))
+    pieces, ask = tuple(_pieces(query)), _Asking(ask)
     key = REPORT.under(query.site, query.machine)
     selectors = [f"{key}?_time=[{_moment(begin)}..{_moment(end)}];limit=1" for begin, end in pieces]
     with ThreadPoolExecutor(PARALLEL) as pool:
