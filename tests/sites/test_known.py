@@ -151,6 +151,16 @@ def test_a_daemon_that_lost_its_numbers_is_heard_again_with_its_second_report() 
     assert not only(knowledge).has_rival(START + 62.0)
 
 
+def test_two_reports_that_come_late_on_two_days_replace_no_later_one() -> None:
+    """Only the report after one that was refused shows that a daemon counts anew."""
+    knowledge, day = Knowledge(), 86_400.0
+    for index in range(2):
+        now = START + index * day
+        take(knowledge, report_of(number=100 * index + 9, end=now, state=Level.ACT))
+        assert take(knowledge, report_of(number=100 * index + 8, end=now - WINDOW), now) is None
+    assert only(knowledge).state(now) is Level.ACT
+
+
 def test_a_forged_number_does_not_silence_a_machine_and_the_conflict_is_seen() -> None:
     """Whatever number a stranger writes, and whether it is once or after each report of the true machine."""
     knowledge, shown = Knowledge(), 0

@@ -179,6 +179,7 @@ def test_a_search_is_written_back_as_text(site: Served) -> None:
         ({"host": "[::1"}, "GET", 421),
         ({"origin": "http://attacker.example"}, "GET", 403),
         ({"origin": "null"}, "GET", 403),
+        ({"origin": "http://["}, "GET", 403),
         ({}, "POST", 405),
         ({}, "DELETE", 405),
         ({}, "OPTIONS", 405),

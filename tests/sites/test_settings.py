@@ -28,8 +28,12 @@ from tests.messages import assert_refuses, assert_says
         ('machines = ["hall/../x"]', ("machines", "not a valid name")),
         ('language = "fr"', ("language", "de")),
         ("title = 3", ("title",)),
+        *((f'[outlets.webhook]\nurl = "{url}"', ("outlets.webhook.url", "https://example.org/hook"))
+          for url in ("http://a:99999/", "http://a:b/", "http://a:0/", "http://[", "http://a/b c", "http://a/\u00fc",
+                      "http://a/\\n", "ftp://a/")),
+        ('[outlets.mqtt]\nhost = "broker"\nuser = "a"\npassword_file = "b"', ("outlets.mqtt", "tls")),
     ],
-)
+)  # fmt: skip
 def test_a_mistake_is_named_with_its_key_and_remedy(tmp_path: Path, text: str, needles: tuple[str, ...]) -> None:
     file = tmp_path / "site.toml"
     file.write_text(text, encoding="utf-8")

@@ -86,11 +86,19 @@ class Guard:
         if scope["method"] not in ("GET", "HEAD"):
             return 405, "the site is read only"
         for origin in (value for name, value in headers if name == b"origin"):
-            if urlsplit(origin).netloc.lower() != hosts[0].lower():
+            if _place(origin) != hosts[0].lower():
                 return 403, "this request comes from the page of another site"
         if len(scope["query_string"]) > MAX_QUERY:
             return 414, f"the query has more than {MAX_QUERY} characters"
         return None
+
+
+def _place(origin: str) -> str:
+    """Return host and port of an ``Origin`` header; empty if it is no address."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
 
 
 def host_named(header: str) -> str:

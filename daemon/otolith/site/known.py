@@ -89,15 +89,14 @@ class KnownMachine:
     size: int = 0  # Bytes of its report
     reports: int = 0  # That were taken
     is_asked: bool = False  # Whether its daemon was asked for its past
-    refused: int | None = None  # Number of the last report that was refused because of it
+    refused: tuple[int, float] | None = None  # Number of the last report that was refused because of it, and when
     restarts: tuple[float, ...] = ()  # When a lower number followed
 
     def is_silent(self, now: float) -> bool:
         """Whether nothing is known at present."""
         if self.report is None or not self.is_alive:
             return True
-        window = self.report.window
-        return now - self.heard > SILENT_WINDOWS * min(window.end - window.start, MAX_WINDOW) + SILENT_SLACK
+        return now - self.heard > _patience(self.report)
 
     def has_rival(self, now: float) -> bool:
         """Whether two daemons publish under its name, or one that does not keep its numbers starts again and again."""
@@ -117,6 +116,11 @@ class KnownMachine:
         shares = {name: share for name, row in self.report.parameters.items() if (share := share_of(row)) is not None}
         name = max(shares, key=lambda name: shares[name], default=None)
         return None if name is None else (name, shares[name])
+
+
+def _patience(report: ReportDocument) -> float:
+    """Return for how long the report after this one may be waited for, s."""
+    return SILENT_WINDOWS * min(report.window.end - report.window.start, MAX_WINDOW) + SILENT_SLACK
 
 
 def share_of(parameter: ParameterDocument) -> float | None:
@@ -241,8 +245,9 @@ class Knowledge:
         if known is not None and (step := _step(known, report)) is not None and step <= 0:
             if step == 0 or is_past:
                 return known
-            before, known.refused = known.refused, report.sequence
-            if before is None or (report.sequence or 0) <= before:  # one that comes late
+            before, known.refused = known.refused, (report.sequence or 0, now)
+            is_next = before is not None and before[0] < known.refused[0] and now - before[1] <= _patience(report)
+            if not is_next:  # one that comes late
                 return RefusedFor.NUMBER
             known.refused, known.restarts = None, (*known.restarts, now)[-RIVALS:]  # the numbers go on from there
         machine = self._machine(site, name, now, len(content) - (known.size if known else 0))

@@ -77,12 +77,19 @@ def certificate_and_key(certificate_path: Path, key_path: Path) -> tuple[x509.Ce
     return own, key
 
 
-def password(path: Path | None) -> str:
-    """Return the first line of a password file, empty without one; raise ConfigurationError as :func:`secret`."""
+def password(path: Path | None, key: str = "password_file") -> str:
+    """Return the first line of the file that ``key`` of the table names, empty without one.
+
+    Raises:
+        ConfigurationError: as :func:`secret`, or the line is empty.
+    """
     if path is None:
         return ""
-    lines = secret(path, ("driver", "password_file")).decode(errors="replace").splitlines()
-    return lines[0] if lines else ""
+    where = ("driver", key)
+    lines = secret(path, where).decode(errors="replace").splitlines()
+    if not lines or not lines[0].strip():
+        raise ConfigurationError(f"{path}: its first line is empty: write the secret there", where)
+    return lines[0]
 
 
 def _is_pem(data: bytes) -> bool:

@@ -190,18 +190,22 @@ def test_no_more_is_told_than_the_limit_allows_and_the_rest_is_counted(rig: Rig)
         wait_for(lambda: rig.events() is None or len(rig.events() or ()) == 8)
 
 
-def test_a_file_that_is_missing_is_named(rig: Rig) -> None:
+@pytest.mark.parametrize("content", [None, b"", b"\nsecret\n", b" \t\n"])
+def test_a_secret_that_is_missing_or_empty_is_named(rig: Rig, content: bytes | None) -> None:
     works, tables = Works(), {"mqtt": ('user = "a"', "password_file"), "mail": ('user = "a"', "password_file"),
                               "webhook": ("", "secret_file"),
                               "opcua": ('user = "a"', "password_file")}  # fmt: skip
     name = next(name for name, kind in RIGS.items() if isinstance(rig, kind))
     lines, key = tables[name]
     more = f'{lines}\n{key} = "nowhere"'
+    if content is not None:
+        (rig.folder / "nowhere").write_bytes(content)
+        (rig.folder / "nowhere").chmod(0o600)
     own = "\n".join(line for line in rig.table().splitlines() if not line.startswith((key, "security")))
     rig.table = lambda: own  # type: ignore[method-assign]
     with pytest.raises(ConfigurationError) as caught:
         runner_of(rig, works, more)
-    assert_says(str(caught.value), "site.toml", f"outlets.{name}", "nowhere")
+    assert_says(str(caught.value), "site.toml", f"outlets.{name}", "nowhere", *([] if content is None else [key]))
 
 
 def test_each_outlet_has_a_rig() -> None:

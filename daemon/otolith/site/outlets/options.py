@@ -37,8 +37,12 @@ def _topic(text: str) -> str:
 
 def _web_address(text: str) -> str:
     """Return ``text``, or raise ValueError if it is no address of HTTP."""
-    parts = urlsplit(text)
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.username is not None:
+    try:
+        parts = urlsplit(text)
+        is_address = parts.scheme in ("http", "https") and parts.hostname and parts.username is None and parts.port != 0
+    except ValueError:  # of a port, or of an address in brackets
+        is_address = False
+    if not is_address or not text.isascii() or not text.isprintable() or " " in text:
         raise ValueError(f'{text!r} is no address: write it like "https://example.org/hook", without a password')
     return text
 
@@ -54,6 +58,14 @@ def _mail_address(text: str) -> str:
 Address = Annotated[str, AfterValidator(_address)]
 Topic = Annotated[str, AfterValidator(_topic)]
 MailAddress = Annotated[str, AfterValidator(_mail_address)]
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether a host is this computer."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
 
 
 class NoticeOptions(StrictModel):
@@ -77,6 +89,8 @@ class MqttOutlet(NoticeOptions, CredentialOptions):
     def _is_consistent(self) -> Self:
         if not self.tls and (self.ca or self.certificate):
             raise ValueError("ca, certificate and key belong to tls = true")
+        if self.user is not None and not self.tls and not _is_loopback(self.host):
+            raise ValueError("user belongs to tls = true: the password would be sent as it is")
         return self
 
 
@@ -117,7 +131,7 @@ class OpcuaOutlet(NoticeOptions, CredentialOptions):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        is_open = not ipaddress.ip_address(self.listen.rpartition(":")[0].strip("[]")).is_loopback
+        is_open = not _is_loopback(self.listen.rpartition(":")[0])
         if is_open and (self.certificate is None or self.user is None):
             keys = "certificate, key, user and password_file"
             raise ValueError(f"listen = {self.listen!r} is for other computers: set {keys}")

@@ -78,6 +78,6 @@ class Webhook:
 
 def build(options: WebhookOutlet, setup: OutletSetup) -> Webhook:
     """Return the outlet; raise ConfigurationError if a file cannot be used."""
-    secret = password(None if options.secret_file is None else setup.folder / options.secret_file)
+    secret = password(None if options.secret_file is None else setup.folder / options.secret_file, "secret_file")
     is_encrypted = urlsplit(options.url).scheme == "https"
     return Webhook(options, secret.encode(), tls_context(setup.folder, options.ca) if is_encrypted else None)
