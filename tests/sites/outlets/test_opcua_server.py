@@ -1,5 +1,6 @@
 """What an OPC UA client reads of a machine, receives of its events, and may not do."""
 
+import dataclasses
 import socket
 import time
 from collections import deque
@@ -15,8 +16,9 @@ from asyncua.sync import Client
 
 from otolith.health.limits import Level
 from otolith.health.schema import Status
-from otolith.site.outlets.base import MachineView, Notice, OutletSetup, Told
-from otolith.site.outlets.opcua import OpcuaServer, build
+from otolith.site.known import MAX_PARAMETERS
+from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
+from otolith.site.outlets.opcua import OWN_NAMES, OpcuaServer, build
 from otolith.site.outlets.options import OpcuaOutlet
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
@@ -132,6 +134,80 @@ def test_texts_from_outside_are_texts_and_names_of_nodes(served: tuple[OpcuaServ
         names = {node.read_browse_name().Name for node in child(client, "hostile").get_children()}
     assert len(names) == len(TEXTS) + 5
     assert not set("\n\r\0\x1b\u202e") & set("".join(names))
+
+
+def test_no_name_hides_the_node_of_another(served: tuple[OpcuaServer, str]) -> None:
+    """Names that would have one node id, or one name, without an escape."""
+    outlet, address = served
+    parameter = report_of().parameters["R_a"]
+    names = ["a", "a/limit", "a/unit", "a%2Flimit", "State", "OpenEvents", "x" * 150, "x" * 151]
+    rows = {name: parameter.model_copy(update={"value": float(index)}) for index, name in enumerate(names)}
+    own = view("names", parameters=rows)
+    outlet.send([own, dataclasses.replace(own, site="Otolith")], [], deque())
+    with connected(address) as client:
+        assert child(client, "names", "State").read_value() == "ACT"
+        nodes = child(client, "names").get_children()
+        names = [node.read_browse_name().Name for node in nodes]
+        assert len(set(names)) == len(names) == len(rows) + 5
+        values = {node.read_value() for name, node in zip(names, nodes, strict=True) if name not in OWN_NAMES}
+        assert values == set(map(float, range(len(rows))))
+        other = client.nodes.objects.get_child([f"{child(client, 'names').nodeid.NamespaceIndex}:{step}"
+                                                for step in ("Otolith", "Otolith", "names", "State")])  # fmt: skip
+        assert other.read_value() == "ACT"
+
+
+def test_the_names_of_a_machine_are_bounded_also_one_after_the_other(served: tuple[OpcuaServer, str]) -> None:
+    outlet, address = served
+    parameter = report_of().parameters["R_a"]
+    for index in range(0, 2 * MAX_PARAMETERS, 32):
+        rows = {f"p{index + offset}": parameter for offset in range(32)}
+        outlet.send([view("many", parameters=rows)], [], deque())
+    with connected(address) as client:
+        assert len(child(client, "many").get_children()) == MAX_PARAMETERS + 5
+
+
+def test_a_machine_that_cannot_be_shown_hinders_no_other(
+    served: tuple[OpcuaServer, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outlet, address = served
+    show = OpcuaServer._show
+
+    async def refuse(server: OpcuaServer, own: MachineView) -> None:
+        if own.name == "bad":
+            raise ua.UaStatusCodeError(ua.StatusCodes.BadNodeIdExists)
+        await show(server, own)
+
+    monkeypatch.setattr(OpcuaServer, "_show", refuse)
+    outlet.send([view("bad"), view("good")], [], deque())
+    with connected(address) as client:
+        assert child(client, "good", "State").read_value() == "ACT"
+
+
+def test_a_notice_that_cannot_be_told_is_lost_and_hinders_no_other(
+    served: tuple[OpcuaServer, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outlet, _ = served
+    outlet.send([view()], [], deque())
+
+    async def refuse(server: OpcuaServer, own: Notice) -> None:
+        raise ua.UaStatusCodeError(ua.StatusCodes.BadInternalError)
+
+    monkeypatch.setattr(OpcuaServer, "_trigger", refuse)
+    waiting = deque([Notice(SITE, "press-3", Told.RAISED, raised())] * 2)
+    with pytest.raises(OutletError) as caught:
+        outlet.send([], [], waiting)
+    assert (len(waiting), caught.value.refused) == (0, 2)
+    outlet.send([], [], waiting)
+
+
+def test_a_site_without_machines_has_no_folder(served: tuple[OpcuaServer, str]) -> None:
+    outlet, address = served
+    outlet.send([dataclasses.replace(view(), site="hall-9")], [], deque())
+    outlet.send([], ["hall-9/press-3"], deque())
+    with connected(address) as client:
+        folder = client.nodes.objects.get_child(f"{client.get_namespace_index('urn:otolith:site')}:Otolith")
+        assert "hall-9" not in {node.read_browse_name().Name for node in folder.get_children()}
+    outlet.send([dataclasses.replace(view(), site="hall-9")], [], deque())  # it comes back
 
 
 def test_a_silent_machine_has_bad_values_and_one_that_is_gone_no_node(served: tuple[OpcuaServer, str]) -> None:

@@ -5,6 +5,7 @@ comes later reads ``OpenEvents``.
 """
 
 import asyncio
+import hashlib
 import hmac
 import logging
 import threading
@@ -31,6 +32,7 @@ from otolith_drivers.outside_text import visible
 START_TIMEOUT = 30.0  # s to load the standard address space
 UPDATE_TIMEOUT = 10.0  # s for what has changed
 MAX_NAME = 100  # characters of the name of a node
+OWN_NAMES = ("State", "What", "Advice", "Since", "OpenEvents")  # Of a machine; a parameter has another name
 SEVERITIES = {Level.WATCH: 500, Level.ACT: 800}  # Of OPC UA: 1 to 1000
 CALM = 100  # Severity of an alarm that is over
 NAMESPACE = "urn:otolith:site"
@@ -42,6 +44,8 @@ STATUSES = {
     Status.INVALID: ua.StatusCodes.UncertainSensorNotAccurate,
     Status.UNESTIMATED: ua.StatusCodes.BadWaitingForInitialData,
 }
+
+log = logging.getLogger(__name__)
 
 
 class _Readers:
@@ -77,6 +81,7 @@ class OpcuaServer:
         self._folders: dict[str, Any] = {}
         self._machines: dict[str, _MachineNodes] = {}
         self._alarm: Any = None
+        self._refused = 0  # Notices that cannot be told
 
     def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Write what has changed, and trigger events; see :class:`otolith.site.outlets.base.Outlet`."""
@@ -89,6 +94,9 @@ class OpcuaServer:
             self._wait(self._update(views, gone, notices), UPDATE_TIMEOUT)
         except (OSError, TimeoutError, ua.UaError) as error:
             raise OutletError(failure(error, self._options.listen)) from error
+        if refused := self._refused:
+            self._refused = 0
+            raise OutletError(f"{self._options.listen}: {refused} notices cannot be events of OPC UA", refused)
         return True
 
     def close(self) -> None:
@@ -126,7 +134,8 @@ class OpcuaServer:
         kinds = (ua.UserNameIdentityToken,) if options.user is not None else (ua.AnonymousIdentityToken,)
         server.set_identity_tokens(kinds)
         self._index = await server.register_namespace(NAMESPACE)
-        self._folders = {"": await server.nodes.objects.add_folder(self._id("Otolith"), self._named("Otolith"))}
+        root = await server.nodes.objects.add_folder(self._id(""), self._named("Otolith"))  # no site has an empty name
+        self._folders = {"": root}
         self._machines.clear()
         self._alarm = await server.get_event_generator(ua.ObjectIds.OffNormalAlarmType)
         await server.start()
@@ -134,13 +143,28 @@ class OpcuaServer:
 
     async def _update(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> None:
         for view in views:
-            await self._show(view)
+            try:
+                await self._show(view)
+            except ua.UaError as error:  # what one machine publishes keeps no other from being shown
+                log.warning("opcua: %s is not shown: %s", view.key, visible(str(error)))
         for key in gone:
-            if (nodes := self._machines.pop(key, None)) is not None:
+            if (nodes := self._machines.get(key)) is not None:
                 await self._server.delete_nodes([nodes.node], recursive=True)
+                del self._machines[key]
+                await self._leave(key.partition("/")[0])
         while notices:
-            await self._trigger(notices[0])
+            try:
+                await self._trigger(notices[0])
+            except ua.UaError as error:
+                log.warning("opcua: %s is not told: %s", visible(notices[0].key), visible(str(error)))
+                self._refused += 1
             notices.popleft()
+
+    async def _leave(self, site: str) -> None:
+        """Delete the folder of a site that has no machine."""
+        if not any(key.startswith(f"{site}/") for key in self._machines) and site in self._folders:
+            await self._server.delete_nodes([self._folders[site]], recursive=True)
+            del self._folders[site]
 
     async def _show(self, view: MachineView) -> None:
         nodes = self._machines.get(view.key) or await self._add(view)
@@ -167,8 +191,10 @@ class OpcuaServer:
     async def _show_parameters(self, nodes: _MachineNodes, view: MachineView, report: ReportDocument) -> None:
         at = _moment(report.window.end)
         for name, row in list(report.parameters.items())[:MAX_PARAMETERS]:
-            own = _plain(visible(name))[:MAX_NAME]
+            own = _shown_name(name)
             if (own, "value") not in nodes.numbers:
+                if len(nodes.numbers) >= MAX_PARAMETERS * len(NUMBERS):  # names of now and before
+                    continue
                 await self._add_parameter(nodes, view.key, own, row)
             for kind in NUMBERS:
                 number: float | None = getattr(row, kind)
@@ -183,7 +209,7 @@ class OpcuaServer:
             self._folders[view.site] = area
         node = await area.add_object(self._id(view.key), self._named(view.name))
         texts = {}
-        for name in ("State", "What", "Advice"):
+        for name in OWN_NAMES[:3]:
             texts[name] = await self._variable(node, f"{view.key}/{name}", name, ua.Variant("", ua.VariantType.String))
         empty = ua.Variant([], ua.VariantType.String, is_array=True)
         texts["OpenEvents"] = await self._variable(node, f"{view.key}/OpenEvents", "OpenEvents", empty)
@@ -193,7 +219,7 @@ class OpcuaServer:
         return self._machines[view.key]
 
     async def _add_parameter(self, nodes: _MachineNodes, key: str, name: str, row: ParameterDocument) -> None:
-        zero, place = ua.Variant(0.0, ua.VariantType.Double), f"{key}/parameters/{name}"
+        zero, place = ua.Variant(0.0, ua.VariantType.Double), f"{key}/parameters/{_escaped(name)}"
         value = await self._variable(nodes.node, place, name, zero)
         nodes.numbers[name, "value"] = value
         text = ua.LocalizedText(_plain(visible(row.unit)))
@@ -211,7 +237,7 @@ class OpcuaServer:
         is_active = notice.told is not Told.CLEARED
         place = f"{notice.site}/{notice.machine}"
         alarm.SourceNode, alarm.SourceName = self._id(place), notice.machine
-        alarm.NodeId = self._id(f"{place}/events/{event.id}")  # Of the condition
+        alarm.NodeId = self._id(f"{place}/events/{_escaped(event.id)}")  # Of the condition
         alarm.ConditionName = _plain(visible(event.id))
         alarm.ConditionClassId = ua.NodeId(ua.ObjectIds.MaintenanceConditionClassType)
         alarm.ConditionClassName = ua.LocalizedText("MaintenanceConditionClassType")
@@ -231,6 +257,20 @@ class OpcuaServer:
 
     def _named(self, name: str) -> Any:
         return ua.QualifiedName(name, self._index)
+
+
+def _escaped(name: str) -> str:
+    """Return a name without the sign between the parts of a node id."""
+    return name.replace("%", "%25").replace("/", "%2F")
+
+
+def _shown_name(name: str) -> str:
+    """Return the name of the node of a parameter; two parameters have two."""
+    own = _plain(visible(name))
+    if len(own) > MAX_NAME:
+        digest = hashlib.sha256(name.encode(errors="replace")).hexdigest()[:8]
+        own = f"{own[: MAX_NAME - 9]}~{digest}"
+    return f"parameter_{own}" if own in OWN_NAMES else own
 
 
 def _plain(text: str) -> str:
