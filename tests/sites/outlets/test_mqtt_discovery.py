@@ -108,6 +108,48 @@ def test_a_machine_that_is_silent_has_no_values_and_one_that_is_gone_has_no_topi
         assert not [topic for topic in retained if "/b/" in topic or "hall_-_b" in topic]
 
 
+def test_a_machine_that_is_gone_after_a_lost_connection_has_no_topic(rig: MqttRig) -> None:
+    with publisher(rig) as outlet:
+        outlet.send([view("a"), view("b")], [], deque())
+        outlet.close()  # as after a failure
+        outlet.send([view("a")], ["hall/b"], deque())
+        retained = rig.retained()
+        assert not [topic for topic in retained if "/b/" in topic or "hall_-_b" in topic]
+        assert json.loads(retained["otolith/hall/a/state"])["state"] == "OK"
+        assert len(configurations(rig)) == 2
+
+
+def test_a_parameter_that_is_gone_is_not_discovered_any_more(rig: MqttRig) -> None:
+    parameter = report_of().parameters["R_a"]
+    with publisher(rig) as outlet:
+        outlet.send([view(parameters={"R_a": parameter, "D": parameter})], [], deque())
+        outlet.send([view(parameters={"R_a": parameter})], [], deque())
+        assert {topic.split("/")[-2] for topic in configurations(rig)} == {"state", "R_a"}
+
+
+def test_a_parameter_with_the_name_of_the_state_has_a_sensor_of_its_own(rig: MqttRig) -> None:
+    parameter = report_of().parameters["R_a"]
+    names = ("state", "parameter_state", "R_a")
+    with publisher(rig) as outlet:
+        outlet.send([view(parameters=dict.fromkeys(names, parameter))], [], deque())
+        found = configurations(rig)
+        assert len(found) == len({own["unique_id"] for own in found.values()}) == 4
+        assert sum("options" in own for own in found.values()) == 1
+        outlet.send([], ["hall/press_1"], deque())
+        assert configurations(rig) == {}
+
+
+def test_after_the_end_of_the_site_nothing_is_known_of_its_machines(rig: MqttRig) -> None:
+    with publisher(rig) as outlet:
+        outlet.send([view("a"), view("b"), view("c")], [], deque())
+        outlet.send([], ["hall/c"], deque())
+    retained = rig.retained()
+    for name in ("a", "b"):
+        assert json.loads(retained[f"otolith/hall/{name}/state"])["state"] == "NO DATA"
+        assert retained[f"otolith/hall/{name}/availability"] == b"offline"
+    assert not [topic for topic in retained if "/c/" in topic]
+
+
 def test_two_machines_have_two_ids(rig: MqttRig) -> None:
     with publisher(rig) as outlet:
         outlet.send([view("a_b"), view("a__b"), view("a-b")], [], deque())

@@ -14,12 +14,15 @@ from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 
 from otolith import __version__
-from otolith.health.schema import ParameterDocument
+from otolith.health.limits import Level
+from otolith.health.schema import Language, ParameterDocument
+from otolith.health.text import texts_in
 from otolith.site.hall import SHOWN
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
 from otolith.site.outlets.connections import failure, tls_context
 from otolith.site.outlets.options import MqttOutlet
+from otolith.site.words import words_in
 from otolith_drivers.common.credentials import password
 from otolith_drivers.grammars.json_lines import json_text
 from otolith_drivers.outside_text import visible
@@ -36,9 +39,11 @@ IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template 
 class MqttPublisher:
     """Implements :class:`otolith.site.outlets.base.Outlet`. Each connection begins with all that is known."""
 
-    def __init__(self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None) -> None:
-        self._options, self._secret, self._tls = options, secret, tls
+    def __init__(self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None, language: Language) -> None:
+        self._options, self._secret, self._tls, self._language = options, secret, tls, language
         self._client: mqtt.Client | None = None
+        self._shown: dict[str, tuple[str, str]] = {}  # Site and name of each machine of this connection
+        self._configured: set[str] = set()  # Machines of which this connection has published configurations
         self._discovered: dict[str, frozenset[tuple[str, str]]] = {}  # Parameters and units of a machine
 
     @property
@@ -53,7 +58,9 @@ class MqttPublisher:
             for view in views:
                 for topic, document in (*self._discovery(view), *self._documents(view)):
                     last = _publish(client, topic, document, retain=True)
+                self._shown[view.key] = (view.site, view.name)
             for key in gone:
+                self._shown.pop(key, None)
                 for topic in (*self._topics(key), *self._forgotten(key)):
                     last = _publish(client, topic, None, retain=True)
             for notice in notices:
@@ -70,12 +77,17 @@ class MqttPublisher:
         return True
 
     def close(self) -> None:
-        """Say that the site is away, and end the connection."""
+        """Say that the site is away and that nothing is known of its machines any more, and end the connection."""
         client, self._client = self._client, None
-        self._discovered.clear()
+        shown, self._shown = self._shown, {}
+        self._configured.clear()
         if client is not None:
-            with contextlib.suppress(ValueError, RuntimeError):  # the connection was lost: the broker says it then
-                client.publish(self._availability, OFFLINE, qos=1, retain=True).wait_for_publish(CLOSING)
+            with contextlib.suppress(ValueError, RuntimeError, OSError):  # it was lost: the broker says it then
+                last = _publish(client, self._availability, OFFLINE, retain=True)
+                for key, own in shown.items():
+                    for topic, document in self._unknown(key, own):
+                        last = _publish(client, topic, document, retain=True)
+                last.wait_for_publish(CLOSING)
             client.disconnect()
             client.loop_stop()
 
@@ -128,15 +140,28 @@ class MqttPublisher:
             yield parameters, {"time": _iso(view.report.window.end), "parameters": rows}
         yield availability, OFFLINE if view.report is None else ONLINE
 
+    def _unknown(self, key: str, own: tuple[str, str]) -> Iterator[tuple[str, Any]]:
+        """Yield what is published of a machine when the site ends: who comes later would read its last state."""
+        state, _, availability = self._topics(key)
+        yield availability, OFFLINE
+        texts = texts_in(self._language)
+        yield state, {"site": own[0], "machine": own[1], "state": str(Level.NO_DATA), "since": None,
+                      "word": texts.translated(Level.NO_DATA), "what": words_in(self._language)["site_away"],
+                      "advice": words_in(self._language)["site_away_advice"]}  # fmt: skip
+
     def _discovery(self, view: MachineView) -> Iterator[tuple[str, Any]]:
         """Yield the configurations of its sensors, as Home Assistant documents them, if they are new."""
         if self._options.discovery is None or view.report is None:
             return
         first = islice(view.report.parameters.items(), MAX_PARAMETERS)
         own = frozenset((name, row.unit) for name, row in first if IDENTIFIER.fullmatch(name))
-        if self._discovered.get(view.key) == own:
+        before = self._discovered.get(view.key, frozenset())
+        if before == own and view.key in self._configured:
             return
+        self._configured.add(view.key)
         self._discovered[view.key] = own
+        for name in sorted({name for name, _ in before} - {name for name, _ in own}):
+            yield self._config(view.key, _sensor_id(name)), None
         state, parameters, availability = self._topics(view.key)
         device = {"identifiers": [_object_id(view.key)], "name": view.name, "manufacturer": "Otolith",
                   "model": visible(view.report.twin), "suggested_area": view.site}  # fmt: skip
@@ -148,8 +173,9 @@ class MqttPublisher:
             "options": [str(level) for level in SHOWN], "availability": [of_site], "icon": "mdi:engine",
         }  # fmt: skip
         for name, unit in sorted(own):
-            yield self._config(view.key, name), {
-                **both, "name": name, "unique_id": f"{_object_id(view.key)}_{name}", "state_topic": parameters,
+            yield self._config(view.key, _sensor_id(name)), {
+                **both, "name": name, "unique_id": f"{_object_id(view.key)}_{_sensor_id(name)}",
+                "state_topic": parameters,
                 "value_template": f"{{{{ value_json.parameters['{name}'].value }}}}", "state_class": "measurement",
                 "availability": [of_site, {"topic": availability}], "availability_mode": "all",
                 **({"unit_of_measurement": visible(unit)} if unit not in ("", "1") else {}),
@@ -161,7 +187,8 @@ class MqttPublisher:
     def _forgotten(self, key: str) -> list[str]:
         """Return the topics of the configurations of a machine that is gone."""
         own = self._discovered.pop(key, None)
-        return [] if own is None else [self._config(key, name) for name in ("state", *(name for name, _ in own))]
+        names = () if own is None else ("state", *(_sensor_id(name) for name, _ in own))
+        return [self._config(key, name) for name in names]
 
 
 def _publish(client: mqtt.Client, topic: str, document: Any, *, retain: bool) -> mqtt.MQTTMessageInfo:
@@ -176,6 +203,11 @@ def _publish(client: mqtt.Client, topic: str, document: Any, *, retain: bool) ->
 def _object_id(key: str) -> str:
     """Return the id of a machine in Home Assistant; no two machines have the same one."""
     return "otolith_" + key.replace("_", "__").replace("/", "_-_")
+
+
+def _sensor_id(name: str) -> str:
+    """Return the id of the sensor of a parameter; the state of the machine is ``state``."""
+    return f"parameter_{name}" if re.fullmatch("(parameter_)*state", name) else name
 
 
 def _row(row: ParameterDocument) -> dict[str, Any]:
@@ -194,4 +226,5 @@ def build(options: MqttOutlet, setup: OutletSetup) -> MqttPublisher:
     """Return the outlet; raise ConfigurationError if a file cannot be used."""
     secret = password(None if options.password_file is None else setup.folder / options.password_file)
     pair = (options.certificate, options.key)
-    return MqttPublisher(options, secret, tls_context(setup.folder, options.ca, pair) if options.tls else None)
+    tls = tls_context(setup.folder, options.ca, pair) if options.tls else None
+    return MqttPublisher(options, secret, tls, setup.language)
