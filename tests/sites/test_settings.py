@@ -30,7 +30,7 @@ from tests.messages import assert_refuses, assert_says
         ("title = 3", ("title",)),
         *((f'[outlets.webhook]\nurl = "{url}"', ("outlets.webhook.url", "https://example.org/hook"))
           for url in ("http://a:99999/", "http://a:b/", "http://a:0/", "http://[", "http://a/b c", "http://a/\u00fc",
-                      "http://a/\\n", "ftp://a/")),
+                      "ftp://a/")),
         ('[outlets.mqtt]\nhost = "broker"\nuser = "a"\npassword_file = "b"', ("outlets.mqtt", "tls")),
     ],
 )  # fmt: skip

@@ -164,6 +164,8 @@ def test_the_names_of_a_machine_are_bounded_also_one_after_the_other(served: tup
         outlet.send([view("many", parameters=rows)], [], deque())
     with connected(address) as client:
         assert len(child(client, "many").get_children()) == MAX_PARAMETERS + 5
+        gone = child(client, "many", "p0").read_data_value(raise_on_bad_status=False)
+        assert gone.StatusCode.value == ua.StatusCodes.BadNoCommunication
 
 
 def test_a_machine_that_cannot_be_shown_hinders_no_other(

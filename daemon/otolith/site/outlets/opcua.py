@@ -176,20 +176,22 @@ class OpcuaServer:
         await nodes.texts["Since"].write_value(_value(since, ua.VariantType.DateTime, code))
         events = [] if view.report is None else [self._title(event) for event in view.report.open_events]
         await nodes.texts["OpenEvents"].write_value(ua.DataValue(ua.Variant(events, ua.VariantType.String)))
-        if view.report is None:
-            for node in nodes.numbers.values():
-                last = await node.read_data_value(raise_on_bad_status=False)
-                code = ua.StatusCodes.BadNoCommunication
-                await node.write_value(_value(last.Value.Value if last.Value else None, ua.VariantType.Double, code))
-        else:
-            await self._show_parameters(nodes, view, view.report)
+        shown = set() if view.report is None else await self._show_parameters(nodes, view, view.report)
+        for name, kind in nodes.numbers.keys() - shown:
+            node = nodes.numbers[name, kind]
+            last = await node.read_data_value(raise_on_bad_status=False)
+            code = ua.StatusCodes.BadNoCommunication
+            await node.write_value(_value(last.Value.Value if last.Value else None, ua.VariantType.Double, code))
 
     def _title(self, event: Any) -> str:
         texts = texts_in(self._setup.language)
         return _plain(visible(f"{texts.translated(event.state)} {texts.part(event.part)}: {event.condition}"))
 
-    async def _show_parameters(self, nodes: _MachineNodes, view: MachineView, report: ReportDocument) -> None:
-        at = _moment(report.window.end)
+    async def _show_parameters(
+        self, nodes: _MachineNodes, view: MachineView, report: ReportDocument
+    ) -> set[tuple[str, str]]:
+        """Return what has a value; the others are of earlier reports."""
+        at, shown = _moment(report.window.end), set[tuple[str, str]]()
         for name, row in list(report.parameters.items())[:MAX_PARAMETERS]:
             own = _shown_name(name)
             if (own, "value") not in nodes.numbers:
@@ -201,6 +203,8 @@ class OpcuaServer:
                 code = STATUSES[row.status] if kind in ("value", "low", "high") else ua.StatusCodes.Good
                 code = ua.StatusCodes.BadNoData if number is None and code == ua.StatusCodes.Good else code
                 await nodes.numbers[own, kind].write_value(_value(number, ua.VariantType.Double, code, at))
+                shown.add((own, kind))
+        return shown
 
     async def _add(self, view: MachineView) -> _MachineNodes:
         area = self._folders.get(view.site)

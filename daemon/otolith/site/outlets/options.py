@@ -42,7 +42,7 @@ def _web_address(text: str) -> str:
         is_address = parts.scheme in ("http", "https") and parts.hostname and parts.username is None and parts.port != 0
     except ValueError:  # of a port, or of an address in brackets
         is_address = False
-    if not is_address or not text.isascii() or not text.isprintable() or " " in text:
+    if not is_address or not text.isascii() or " " in text:
         raise ValueError(f'{text!r} is no address: write it like "https://example.org/hook", without a password')
     return text
 
