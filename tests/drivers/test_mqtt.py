@@ -286,7 +286,9 @@ def test_a_list_at_the_root_is_read_by_its_index() -> None:
         wait_for(lambda: len(samples) == 80)
     times = np.array([sample.time for sample in samples if sample.signal == "i"])
     assert [sample.value for sample in samples if sample.signal == "i"] == list(range(40))
-    assert np.diff(times) == pytest.approx(STEP, abs=0.01)
+    assert (np.diff(times) > 0.0).all()
+    # The clock of the sender is that of the message that was least late; on a busy computer it is not the first.
+    assert np.diff(times[20:]) == pytest.approx(STEP, abs=0.01)
 
 
 @pytest.mark.parametrize("path", ["a..b", "[x].t", "[0]..t", ".a", "a.", "[0]t", "a" * 201])
