@@ -119,6 +119,8 @@ def test_what_is_wrong_with_a_machine_harms_no_other(hall: RunningHall, folder: 
     hall.have(2, *GOOD, "dead-bus")
     log = hall.log.read_text(encoding="utf-8")
     assert "bad-file.toml" in log
+    assert "demo.one: machine one" in log
+    assert "demo.busy: not served" in log
     assert "other-name.toml: not served" in log
     dead = hall.reports["dead-bus"][-1]
     assert dead.health is not None

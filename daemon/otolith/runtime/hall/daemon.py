@@ -115,9 +115,10 @@ class Daemon:
 
     @contextlib.contextmanager
     def _alone_or_left_out(self, *services: Service) -> Iterator[None]:
-        """Leave machines out that cannot be served; if there is one only, raise the error."""
+        """Leave machines out that cannot be served; the error of a machine that is alone is raised."""
         try:
-            yield
+            with about(services[0].title if len(services) == 1 and not self._is_alone else ""):
+                yield
         except Exception as error:
             if self._is_alone:
                 raise
