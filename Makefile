@@ -8,7 +8,7 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test test-full system-test check conditions bench paper screens clean
+.PHONY: help demo test test-full system-test check conditions schemas bench paper screens clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
@@ -20,6 +20,8 @@ help:
 	@echo "make check   ruff, mypy --strict, import rules"
 	@echo "make conditions"
 	@echo "             write the pages docs/conditions.md and docs/conditions.de.md anew"
+	@echo "make schemas"
+	@echo "             write docs/reference/schemas anew: JSON Schema of what daemons publish"
 	@echo "make bench   print the benchmarks"
 	@echo "make paper   the scenarios of the paper: our figures beside the paper's, with plots"
 	@echo "make screens pictures and texts of every screen, for the docs, from one seeded run"
@@ -56,6 +58,11 @@ check: $(DEV)
 conditions: $(DEV)
 	$(BIN)/python -m otolith explain --markdown --language en > docs/conditions.md
 	$(BIN)/python -m otolith explain --markdown --language de > docs/conditions.de.md
+
+# What readers of other programs check documents with; 'otolith schema' prints the same.
+schemas: $(DEV)
+	for kind in report event parameter health start; do \
+	  $(BIN)/python -m otolith schema $$kind > docs/reference/schemas/$$kind.json || exit 1; done
 
 bench: $(BENCH)
 	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done

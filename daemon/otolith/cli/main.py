@@ -47,6 +47,7 @@ from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
 from otolith.cli.operation.simulate import simulate
 from otolith.cli.operation.view import view
+from otolith.cli.schema import schema
 from otolith.cli.site import site
 from otolith.cli.terminal import echo
 
@@ -389,6 +390,7 @@ COMMANDS: tuple[click.Command, ...] = (
     report,
     reproduce,
     reset,
+    schema,
     simulate,
     site,
     twin,
