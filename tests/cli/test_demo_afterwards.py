@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli.demo import Demo
-from otolith.cli.machines import last_spoken
+from otolith.cli.machines import last_reports
 from otolith.cli.main import cli
 from otolith.cli.operation import view as module
 from otolith.health.limits import Level
@@ -101,5 +101,5 @@ def test_the_recording_of_a_demo_is_viewed_by_name_if_there_is_no_other(services
 def test_who_watches_after_a_demo_learns_when_it_ended() -> None:
     demo("20260131T101112", 7200.0, 6.5)
     demo("20260131T111112", 600.0, 6.6)
-    (line,) = last_spoken()
+    (line,) = last_reports()
     assert_says(line, f"{SITE}.{MACHINE}", "10 min ago", "otolith report")

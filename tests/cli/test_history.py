@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli import common
-from otolith.cli.machines import last_spoken
+from otolith.cli.machines import last_reports
 from otolith.cli.main import cli
 from otolith.cli.operation.history import end_of
 from otolith.health.labels import Numbers
@@ -276,7 +276,7 @@ def test_a_damaged_report_prevents_no_command_that_does_without_it(written: Hist
         if count == 1 or arguments[0] != "report":  # a page is made of reports
             done = CliRunner().invoke(cli, arguments, standalone_mode=False)
             assert done.exception is None, arguments
-    assert list(last_spoken(MACHINE))
+    assert list(last_reports(MACHINE))
 
 
 def test_times_keep_language_and_zone_of_the_machine_if_a_report_is_damaged(written: HistoryWriter) -> None:

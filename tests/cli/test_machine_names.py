@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.cli import common
-from otolith.cli.machines import file_of, key_of, last_spoken, reader_of
+from otolith.cli.machines import file_of, key_of, last_reports, reader_of
 from otolith.cli.main import cli
 from otolith.cli.operation.live_table import FIRST_ANSWER, waiting_text
 from otolith.cli.operation.view import Recordings
@@ -129,9 +129,9 @@ def test_a_command_of_a_machine_takes_its_name(machine_file: Path) -> None:
 
 
 @pytest.mark.parametrize("spelling", ["*", MACHINE, f"{SITE}.{MACHINE}", "other"])
-def test_who_watches_a_daemon_that_has_ended_learns_when_it_spoke_last(machine_file: Path, spelling: str) -> None:
+def test_who_watches_a_daemon_that_has_ended_learns_when_its_last_report_was(machine_file: Path, spelling: str) -> None:
     del machine_file
-    lines = list(last_spoken(spelling))
+    lines = list(last_reports(spelling))
     assert len(lines) == (spelling != "other")
     for line in lines:
         assert_says(line, f"{SITE}.{MACHINE}", "60 min ago", f"otolith report {SITE}.{MACHINE}")
@@ -139,10 +139,10 @@ def test_who_watches_a_daemon_that_has_ended_learns_when_it_spoke_last(machine_f
 
 def test_a_machine_is_named_as_silent_only_when_its_daemon_had_time_to_answer() -> None:
     """Meanwhile another one may be about to answer: the first line must not name a wrong machine."""
-    spoken = [f"{SITE}.{MACHINE} spoke last an hour ago"]
-    assert MACHINE not in waiting_text(0.0, spoken)
-    assert MACHINE not in waiting_text(0.9 * FIRST_ANSWER, spoken)
-    assert_says(waiting_text(1.1 * FIRST_ANSWER, spoken), "no daemon", spoken[0])
+    known = [f"last report of {SITE}.{MACHINE}: an hour ago"]
+    assert MACHINE not in waiting_text(0.0, known)
+    assert MACHINE not in waiting_text(0.9 * FIRST_ANSWER, known)
+    assert_says(waiting_text(1.1 * FIRST_ANSWER, known), "no daemon", known[0])
 
 
 def test_a_history_says_nothing_of_where_its_file_is_to_a_reader_of_values(machine_file: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from otolith.acquisition.window import Verdict
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument
-from otolith.site.compare import MIN_SISTERS, WEEK, poor_data, sisters, week
+from otolith.site.compare import MIN_PEERS, WEEK, peers, poor_data, week
 from otolith.site.known import Knowledge
 from tests.sites.machines import raised, report_of, sent
 from tests.storage.histories import START
@@ -27,16 +27,16 @@ def known(*values: float) -> Knowledge:
         ((6.5, 6.5, 7.2), set()),  # of three it would be decided by one
     ],
 )
-def test_a_machine_that_differs_from_its_sisters_is_marked(values: tuple[float, ...], marked: set[str]) -> None:
-    (rows,) = sisters(known(*values), START, "en").values()
+def test_a_machine_that_differs_from_its_peers_is_marked(values: tuple[float, ...], marked: set[str]) -> None:
+    (rows,) = peers(known(*values), START, "en").values()
     assert {row.machine.name for row in rows if row.is_outlier} == marked
     assert len(rows) == len(values)
-    assert len(values) >= MIN_SISTERS or not marked
+    assert len(values) >= MIN_PEERS or not marked
     assert rows[0].machine.name == f"m-{values.index(max(values))}"  # the nearest to its limit first
 
 
-def test_one_machine_has_no_sisters() -> None:
-    assert sisters(known(6.5), START, "en") == {}
+def test_one_machine_has_no_peers() -> None:
+    assert peers(known(6.5), START, "en") == {}
 
 
 def test_the_events_of_a_week_are_the_newest_first_without_hints_and_older_ones() -> None:
@@ -60,8 +60,8 @@ def test_a_machine_of_incomplete_data_is_named_with_its_reason() -> None:
     knowledge.take(*sent(report_of("m-1", 2).model_copy(update=own)), START)
     down = {"driver": DriverDocument(up=False, reason="no frame for 5 s")}
     knowledge.take(*sent(report_of("m-2", 2).model_copy(update=down)), START)
-    rows = poor_data(knowledge, START, "en")
+    rows = poor_data(knowledge, START, "en", None)
     assert [(row.machine.name, row.missing, row.reason) for row in rows] == [
         ("m-1", "40%", "omega: 40% missing"), ("m-2", "0%", "no frame for 5 s"),
     ]  # fmt: skip
-    assert poor_data(knowledge, START + 3600.0, "en") == []  # silent: nothing is known of its data
+    assert poor_data(knowledge, START + 3600.0, "en", None) == []  # silent: nothing is known of its data

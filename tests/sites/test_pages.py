@@ -19,6 +19,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import Status
 from otolith.publishing.zenoh_session import session
 from otolith.site.app import MAX_LIVE, MAX_QUERY, REFRESH
+from otolith.site.words import words_in
 from tests.hostile import HOSTILE
 from tests.sites.machines import Daemon, Stranger, daemons, own_endpoint, raised, report_of, sent
 from tests.sites.serving import Served, serving
@@ -106,7 +107,7 @@ def test_the_hall_says_of_each_machine_its_state_why_since_when_and_what_to_do(s
     cards = {each["id"]: each for tag, each in Tags(hall).found if tag == "li" and "id" in each}
     assert list(cards) == [f"m-{SITE}.{name}" for name in (FAULTY, HOSTILE_ONE, WELL)]
     faulty = hall.partition(f'id="m-{SITE}.{FAULTY}"')[2].partition("</li>")[0]
-    for needle in ("ACT", "since", "winding: short circuit between turns", "measure resistance", "R_a 108%", "■"):
+    for needle in ("ACT", "since", "winding: short circuit between turns", "measure resistance", "R_a 108 %", "■"):
         assert needle in faulty
     german = site.ask("/?language=de").text
     assert "seit" in german
@@ -237,7 +238,7 @@ def test_who_claims_the_name_of_another_machine_is_refused(tmp_path: Path) -> No
 
         wait_for(is_refused)
         hall = served.ask("/").text
-        assert "other_name" in hall
+        assert words_in("en")["refused_other_name"].partition("}")[2] in hall
         assert f"m-{SITE}" not in hall
 
 

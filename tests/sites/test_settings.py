@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from otolith.health.schema import LANGUAGES
+from otolith.site.known import RefusedFor
 from otolith.site.settings import load_site
 from otolith.site.words import accepted, words_in
 from otolith_drivers.errors import ConfigurationError
@@ -61,6 +62,7 @@ def test_files_are_relative_to_that_of_the_site(tmp_path: Path) -> None:
 
 def test_each_word_is_in_each_language() -> None:
     assert len({frozenset(words_in(language)) for language in LANGUAGES}) == 1
+    assert {f"refused_{reason}" for reason in RefusedFor} <= set(words_in("en"))
 
 
 @pytest.mark.parametrize("header", ["", "fr", ",", ";q=1", *HOSTILE])

@@ -225,8 +225,8 @@ def _single(text: str, found: dict[Found, MachineIdentity]) -> Found | None:
     return next(iter(found), None)
 
 
-def last_spoken(text: str = "*") -> Iterable[str]:
-    """Yield when each machine of this user spoke last, in words; only that of the name ``text``, unless it is ``*``.
+def last_reports(text: str = "*") -> Iterable[str]:
+    """Yield when the last report of each machine of this user was, in words; ``text`` is a name, or ``*`` for all.
 
     Without any, that is the last demo.
     """
@@ -243,4 +243,4 @@ def last_spoken(text: str = "*") -> Iterable[str]:
             if math.isfinite(last):
                 end, name = labels.unix(last), identity.key
                 when, ago = clock_in(zone)(end), duration_text(time.time() - end)
-                yield f"{name} spoke last at {when}, {ago} ago: 'otolith report {name}' shows it"
+                yield f"last report of {name}: {when}, {ago} ago; 'otolith report {name}' shows it"

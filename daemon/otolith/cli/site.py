@@ -43,7 +43,7 @@ def site(file: Path | None, verbose: bool) -> int:
     try:
         settings, source = (SiteFile(), None) if file is None else load_site(file)
         collector = Collector(settings.connection(folder), settings.machines)
-        setup = OutletSetup(folder, settings.title, settings.language or "en")
+        setup = OutletSetup(folder, settings.title, settings.language, settings.timezone)
         outlets = runners_of(settings.outlets, setup, collector, source)
     except ConfigurationError as error:
         error.exit_code = os.EX_CONFIG  # as 'otolith run', so that systemd does not start it again

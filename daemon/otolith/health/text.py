@@ -109,6 +109,56 @@ def _pattern(phrase: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)
 
 
+REWORDED = ("changed", "not_yet", "no_longer", "no_baseline", "no_temperature", "class_in_words")
+"""Texts of reports that are known by their sentence alone, so that a reader gets them in another language."""
+
+
+def report_in(report: ReportDocument, language: Language | None, zone: str | None = None) -> ReportDocument:
+    """Return a report in the language and zone of its reader, by default in those of the machine.
+
+    Sentences with values, and the texts of rules of the machine file, stay in the language of the machine.
+    """
+    if (health := report.health) is None:
+        return report
+    language = language or health.language
+    source, target = texts_in(health.language), texts_in(language)
+    events = tuple(event_in(event, language, zone) for event in report.events)
+    known = {old.condition: new.condition for old, new in zip(report.events, events, strict=True)}
+
+    def reworded(text: str) -> str:
+        return known.get(text) or PARTS.join(known.get(part) or _reworded(part, source, target)
+                                             for part in text.split(PARTS))  # fmt: skip
+
+    parts = {name: part.model_copy(update={"reason": reworded(part.reason)}) for name, part in health.parts.items()}
+    own = {"language": language, "timezone": zone or health.timezone, "reason": reworded(health.reason), "parts": parts}
+    findings = tuple(row.model_copy(update={"condition": reworded(row.condition)}) for row in report.findings)
+    return report.model_copy(update={"events": events, "findings": findings, "health": health.model_copy(update=own)})
+
+
+def event_in(event: EventDocument, language: Language | None, zone: str | None = None) -> EventDocument:
+    """Return an event in the language of its reader; see :func:`report_in`."""
+    language = language or event.language
+    source, target = texts_in(event.language), texts_in(language)
+    own: dict[str, str] = {} if zone is None else {"timezone": zone}
+    if source is not target:
+        own["language"] = language
+        own |= {key: _reworded(getattr(event, key), source, target) for key in ("text", "setting", "condition")}
+        rows = [target.rules[key] for key in event.condition_id.split() if key in target.rules]
+        if rows and len(rows) == len(event.condition_id.split()):
+            joints = {"condition": target("or"), "cause": target("alternatives"), "advice": PARTS}
+            own |= {key: joint.join(dict.fromkeys(row[key] for row in rows)) for key, joint in joints.items()}
+    return event.model_copy(update=own)
+
+
+def _reworded(text: str, source: Texts, target: Texts) -> str:
+    """Return a text in another language, as far as it is known there."""
+    is_known = source is not target and len(text) <= MAX_SENTENCE
+    for key in REWORDED if is_known else ():
+        if match := _pattern(source.texts[key]).fullmatch(text):
+            return target(key, **match.groupdict())
+    return target.translated(text)
+
+
 def interval_text(value: float, sd: float, unit: str) -> str:
     """A value with its 95 % interval: ``5.9856 ± 0.0075 Ω``; ``sd`` is its standard deviation."""
     return quantity_text(value, unit, QUANTILE * sd)

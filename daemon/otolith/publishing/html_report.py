@@ -28,12 +28,13 @@ from otolith.health.limits import Level
 from otolith.health.schema import (
     ComponentDocument,
     EventDocument,
+    Language,
     ParameterDocument,
     PartDocument,
     ReportDocument,
     Status,
 )
-from otolith.health.text import Texts, texts_in, zone_of
+from otolith.health.text import Texts, texts_in
 from otolith.health.times import clock_in, in_local_time
 from otolith.machine import load_rules
 from otolith.storage.history import DAY, HOUR, PERFORMANCE, RESOLUTIONS, HistorySample, PartState
@@ -133,6 +134,9 @@ class PageSource(Protocol):
     site: str
     machine: str
 
+    def language_and_zone(self) -> tuple[Language | None, str | None]:
+        """Return language and zone of the page; None for English, and for the zone of this computer."""
+
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""
 
@@ -173,7 +177,8 @@ def html_report(reader: PageSource, samples: Iterable[HistorySample], interval: 
     begins = [row.time for row in rows[:1]] + [row.entered for row in states[:1]]
     begin = since if "log" in description else max(since, min([*begins, latest.window.start if latest else since]))
     until = latest.window.end if latest and not is_silent and silence > -DAY else now
-    axis = _axis(min(begin, until - 1.0), until, latest)
+    language, zone_of_page = reader.language_and_zone()
+    axis = _axis(min(begin, until - 1.0), until, latest, zone_of_page)
     gaps = _gaps(sorted({row.time for row in rows}), length) + ([(latest.window.end, until)] if latest else [])
     told = _events(reader, latest, since)
     events = [row for row in told if row[1] is not Level.HINT]
@@ -188,7 +193,7 @@ def html_report(reader: PageSource, samples: Iterable[HistorySample], interval: 
         lstrip_blocks=True,
         finalize=lambda value: _shown(value, say),
     )
-    say = texts_in(latest.health.language if latest and latest.health else "en")
+    say = texts_in(language or "en")
     is_dated = is_of_calendar(axis.begin)
     own_when = (lambda seconds: _moment(seconds, axis.zone, "%F %T")) if is_dated else clock_in(axis.zone)
     own = {"when": own_when, "part": say.part}
@@ -240,12 +245,12 @@ def _shown(value: object, texts: Texts) -> object:
     return visible(texts.decimals(str(value))) if is_text else value
 
 
-def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
+def _axis(begin: float, now: float, latest: ReportDocument | None, zone: str | None) -> Axis:
     """Return the axis with room for the forecasts."""
     forecasts = [row.forecast for row in (latest.parameters.values() if latest else ()) if row.forecast]
     ends = [row.high or row.at for item in forecasts for row in (item.watch, item.act) if row and row.at > now]
     room = min(max(ends, default=now) - now, FORECAST_SHARE * (now - begin))
-    return Axis(begin, now, now + max(room, 0.0), zone_of(latest) if latest else None)
+    return Axis(begin, now, now + max(room, 0.0), zone)
 
 
 def _gaps(times: Sequence[float], length: float) -> list[Span]:
@@ -386,7 +391,7 @@ def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], cur
     median = line((now, *((row.at, row.limit) for row in ahead)))
     early = line((now, *((max(row.low, axis.now), row.limit) for row in ahead)))
     late = line((row.high or far, row.limit) for row in reversed(ahead))
-    future = (f"{early} {late}", median) if ahead else ()
+    future = (Markup(" ").join((early, late)), median) if ahead else ()
     return {"band": band, "lines": lines, "marks": list(_labelled(marks)), "forecast": future}
 
 

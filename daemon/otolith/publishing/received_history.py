@@ -6,7 +6,8 @@ from typing import Any
 
 from otolith.health.diagnosis import Rule
 from otolith.health.limits import Level
-from otolith.health.schema import EventDocument, PartDocument, ReportDocument
+from otolith.health.schema import EventDocument, Language, PartDocument, ReportDocument
+from otolith.health.text import event_in, report_in
 from otolith.publishing.html_report import html_report
 from otolith.storage.history import HOUR, HistorySample, PartState
 
@@ -15,11 +16,22 @@ class ReceivedHistory:
     """What a report page reads. Between two reports nothing is known, so a state is that of the last one."""
 
     def __init__(
-        self, site: str, machine: str, reports: Sequence[ReportDocument], events: Sequence[EventDocument]
-    ) -> None:
-        """``reports`` and ``events`` are the oldest first."""
-        self.site, self.machine = site, machine
-        self._reports, self._events = reports, events
+        self, site: str, machine: str, reports: Sequence[ReportDocument], events: Sequence[EventDocument],
+        reader: tuple[Language | None, str | None] = (None, None),
+    ) -> None:  # fmt: skip
+        """``reports`` and ``events`` are the oldest first; ``reader`` has a language and a zone.
+
+        By default they are those of the machine.
+        """
+        self.site, self.machine, self._reader = site, machine, reader
+        self._reports = [report_in(row, *reader) for row in reports]
+        self._events = [event_in(row, *reader) for row in events]
+
+    def language_and_zone(self) -> tuple[Language | None, str | None]:
+        """Return in which language and zone the page is; None if neither the reader nor the machine has one."""
+        health = self._reports[-1].health if self._reports else None
+        machine, zone = (None, None) if health is None else (health.language, health.timezone)
+        return self._reader[0] or machine, self._reader[1] or zone
 
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""

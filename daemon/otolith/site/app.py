@@ -4,7 +4,6 @@ import asyncio
 import json
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -18,9 +17,10 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from otolith.health.schema import LANGUAGES, Language
+from otolith.health.times import moment_text
 from otolith.publishing.received_history import received_page
 from otolith.site.collector import Collector
-from otolith.site.compare import poor_data, sisters, week
+from otolith.site.compare import peers, poor_data, week
 from otolith.site.hall import PAGES, Filter, Hall
 from otolith.site.metrics import CONTENT_TYPE, exposition
 from otolith.site.outlets.runner import OutletStatus
@@ -35,7 +35,7 @@ SEND_TIMEOUT = 10.0  # s that a slow reader may take for one event
 REFRESH = 30  # s after which a browser asks for the page of a machine again
 MAX_LOOKING = 4  # pages of the past of machines that are made at a time
 MAX_QUERY = 512  # characters of the query of an address
-FIRST_SISTERS = 8  # machines of a parameter that are seen at once, with those that differ
+FIRST_PEERS = 8  # machines of a parameter that are seen at once, with those that differ
 STATIC = {"site.css": "text/css", "site.js": "text/javascript"}
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -140,7 +140,7 @@ class SitePages:
         knowledge, dropped = self._collector.knowledge, self._collector.dropped
         return {
             "language": language, "words": words_in(language), "title": self._settings.title, "here": here,
-            "time": f"{datetime.now(UTC).astimezone():%F %T %Z}", "dropped": dropped.total(),
+            "time": moment_text(time.time(), self._settings.timezone), "dropped": dropped.total(),
             "refused": {reason.value: count for reason, count in knowledge.refused.items()},
         }  # fmt: skip
 
@@ -155,12 +155,12 @@ class SitePages:
 
     async def _show_comparison(self, request: Request) -> Response:
         language, now = self._language(request), time.time()
-        knowledge = self._collector.knowledge
+        knowledge, zone = self._collector.knowledge, self._settings.timezone
         with self._collector.lock:
-            own = {"sisters": sisters(knowledge, now, language), "poor": poor_data(knowledge, now, language),
-                   "events": week(knowledge, now, language, self._settings.timezone)}  # fmt: skip
+            own = {"peers": peers(knowledge, now, language), "poor": poor_data(knowledge, now, language, zone),
+                   "events": week(knowledge, now, language, zone)}  # fmt: skip
         return HTMLResponse(
-            PAGES.get_template("compare.html").render(own, first=FIRST_SISTERS, **self._frame(language, "compare"))
+            PAGES.get_template("compare.html").render(own, first=FIRST_PEERS, **self._frame(language, "compare"))
         )
 
     async def _show_machine(self, request: Request) -> Response:
@@ -179,7 +179,8 @@ class SitePages:
             return self._message(language, "busy", 503)
         try:
             async with self._looking:
-                history = await run_in_threadpool(past_of, self._collector.ask, query, report)
+                own = language, self._settings.timezone
+                history = await run_in_threadpool(past_of, self._collector.ask, query, report, own)
                 page = await run_in_threadpool(received_page, history, query.since, now)
         except (ValueError, LookupError, ArithmeticError, OSError):  # anybody may have published it
             return self._message(language, "unreadable", 502)

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from otolith.health.limits import Level
-from otolith.health.schema import EventDocument, Language, ReportDocument
-from otolith.health.text import Texts, texts_in, undecided_advice, undecided_text, zone_of
+from otolith.health.schema import Language, ReportDocument
+from otolith.health.text import Texts, report_in, texts_in, undecided_advice, undecided_text, zone_of
 from otolith.health.times import in_local_time, moment_text
 from otolith.site.known import KnownMachine, Trace, share_of
 from otolith.site.words import words_in
@@ -30,6 +30,7 @@ class Card:
     what: str
     advice: str
     parameter: str = ""  # Nearest to its limit, with its share of the way there
+    parameter_long: str = ""  # The same in a sentence
     curve: str = ""  # Points of an SVG line, from top to bottom
 
     @property
@@ -40,7 +41,8 @@ class Card:
 
 def card_of(machine: KnownMachine, now: float, language: Language, zone: str | None = None) -> Card:
     """Return the card of a machine."""
-    texts, state, report = texts_in(language), machine.state(now), machine.report
+    texts, state = texts_in(language), machine.state(now)
+    report = None if machine.report is None else report_in(machine.report, language, zone)
     own_zone = zone or (zone_of(report) if report else None)
     since, what, advice = "", texts("no_report"), f"{texts('start_daemon')}: otolith run"
     if report is not None and machine.is_silent(now):
@@ -52,36 +54,31 @@ def card_of(machine: KnownMachine, now: float, language: Language, zone: str | N
         what, advice = _reason(report, texts, own_zone)
     if machine.has_rival(now):
         what, advice = words_in(language)["rival"], words_in(language)["rival_advice"]
-    nearest = machine.nearest
+    nearest, near = machine.nearest, ("", "")
+    if nearest is not None:
+        share = {"name": nearest[0], "share": f"{max(0.0, nearest[1]):.0%}".replace("%", " %")}
+        words = words_in(language)
+        near = words["limit_share"].format(**share), words["limit_share_long"].format(**share)
     return Card(
         site=machine.site, name=machine.name, state=state, symbol=SYMBOLS[state], word=texts.translated(state),
         since=texts("since", time=since) if since else "", what=_short(what, texts), advice=_short(advice, texts),
-        parameter="" if nearest is None else _short(f"{nearest[0]} {max(0.0, nearest[1]):.0%}", texts),
+        parameter=_short(near[0], texts), parameter_long=_short(near[1], texts),
         curve="" if nearest is None else _points(machine, nearest[0]),
     )  # fmt: skip
-
-
-def in_language(event: EventDocument, language: Language) -> tuple[str, str]:
-    """Return condition and advice of an event in a language, as far as its rule has them in it."""
-    if event.language == language:
-        return event.condition, event.advice
-    rule = texts_in(language).rules.get(event.condition_id, {})
-    return rule.get("condition", event.condition), rule.get("advice", event.advice)
 
 
 def _reason(report: ReportDocument, texts: Texts, zone: str | None) -> tuple[str, str]:
     """Return why a machine is in its state, and what to do."""
     events = report.open_events
     if events:
-        condition, advice = in_language(events[0], texts.language)
         more = f" (+{len(events) - 1})" if len(events) > 1 else ""
-        return in_local_time(f"{texts.part(events[0].part)}: {condition}{more}", zone), advice
+        return in_local_time(f"{texts.part(events[0].part)}: {events[0].condition}{more}", zone), events[0].advice
     if undecided := undecided_text(report):
         return undecided, undecided_advice(report)
     if report.health is None:
         return texts("no_state"), ""
     is_well = report.health.state is Level.OK
-    reason = texts.translated(report.health.reason)
+    reason = in_local_time(report.health.reason, zone)
     return reason or (texts("all_well") if is_well else ""), texts("nothing") if is_well else ""
 
 

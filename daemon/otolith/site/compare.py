@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from otolith.acquisition.window import Verdict
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, Language, ParameterDocument
-from otolith.health.text import texts_in, value_text
-from otolith.health.times import moment_text
-from otolith.site.cards import in_language
+from otolith.health.text import event_in, texts_in, value_text, zone_of
+from otolith.health.times import in_local_time, moment_text
 from otolith.site.known import Knowledge, KnownMachine, share_of
 from otolith_drivers.outside_text import visible
 from otolith_drivers.units import quantity_text
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
-MIN_SISTERS = 4  # machines of a twin, from which one can differ from the others
+MIN_PEERS = 4  # machines of a twin, from which one can differ from the others
 OUTLIER = 3.5  # distance to the median over the normal-consistent median absolute deviation
 CONSISTENT = 0.6745  # median absolute deviation of a normal distribution of standard deviation 1
 MAX_ROWS = 200  # events, and machines of a table
@@ -23,8 +22,8 @@ WEEK = 604_800.0  # s
 
 
 @dataclass(frozen=True, slots=True)
-class Sister:
-    """A parameter of a machine beside that of its sisters."""
+class Peer:
+    """A parameter of a machine beside that of its peers."""
 
     machine: KnownMachine
     value: str
@@ -57,8 +56,8 @@ class DataQuality:
     missed: int  # Windows not estimated from because the worker was down or busy
 
 
-def poor_data(knowledge: Knowledge, now: float, language: Language) -> list[DataQuality]:
-    """Return the machines that speak, and of which the last window was bad or a source is down."""
+def poor_data(knowledge: Knowledge, now: float, language: Language, zone: str | None) -> list[DataQuality]:
+    """Return the machines that report, and of which the last window was bad or a source is down."""
     say, found = texts_in(language), []
     for machine in knowledge.worst_first(now):
         report = machine.report
@@ -67,7 +66,9 @@ def poor_data(knowledge: Knowledge, now: float, language: Language) -> list[Data
         quality, driver, counters = report.window.quality, report.driver, report.counters or CountersDocument()
         reasons = [*quality.reasons, *([] if driver is None or driver.up else [driver.reason])]
         if quality.verdict is Verdict.BAD or reasons:
-            words = visible(say.decimals("; ".join(say.translated(reason) for reason in reasons)))
+            own_zone = zone or zone_of(report)
+            written = (in_local_time(say.translated(reason), own_zone) for reason in reasons)
+            words = visible(say.decimals("; ".join(written)))
             missing = say.decimals(f"{quality.missing:.0%}")
             verdict = say.translated(quality.verdict)
             own = DataQuality(machine, verdict, missing, words, counters.windows_bad, counters.windows_missed)
@@ -75,7 +76,7 @@ def poor_data(knowledge: Knowledge, now: float, language: Language) -> list[Data
     return found[:MAX_ROWS]
 
 
-def sisters(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[str, str], list[Sister]]:
+def peers(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[str, str], list[Peer]]:
     """Return the machines of each twin and parameter with a limit, the nearest to its limit first."""
     groups: dict[tuple[str, str], list[tuple[KnownMachine, ParameterDocument, float]]] = {}
     for machine in knowledge:
@@ -91,7 +92,7 @@ def sisters(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[
         rows.sort(key=lambda row: -row[2])
         away = _outliers([share for *_, share in rows])
         found[key] = [
-            Sister(
+            Peer(
                 machine, visible(say.decimals(say.translated(value_text(row)))),
                 say.decimals(quantity_text(row.nominal if row.baseline is None else row.baseline, row.unit)),
                 "" if row.limit is None else say.decimals(quantity_text(row.limit, row.unit)),
@@ -104,7 +105,7 @@ def sisters(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[
 
 def _outliers(shares: list[float]) -> list[bool]:
     """Return which values differ from the others, by the modified z-score of Iglewicz and Hoaglin (1993)."""
-    if len(shares) < MIN_SISTERS:
+    if len(shares) < MIN_PEERS:
         return [False] * len(shares)
     middle = statistics.median(shares)
     spread = statistics.median(abs(share - middle) for share in shares)
@@ -129,8 +130,7 @@ def _worded(
 ) -> Iterator[tuple[float, TimedEvent]]:
     say = texts_in(language)
     for start, machine, key in rows:
-        event = machine.events[key]
-        condition, _ = in_language(event, language)
-        state = event.state if event.end is None else Level.OK
-        time = moment_text(start, zone or event.timezone)
-        yield start, TimedEvent(machine, time, visible(say.part(event.part)), visible(condition), say.translated(state))
+        event = event_in(machine.events[key], language, zone)
+        state = say.translated(event.state if event.end is None else Level.OK)
+        time, part = moment_text(start, event.timezone), say.part(event.part)
+        yield start, TimedEvent(machine, time, visible(part), visible(event.condition), state)

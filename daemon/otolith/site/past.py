@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from otolith.health.schema import EventDocument, ReportDocument
+from otolith.health.schema import EventDocument, Language, ReportDocument
 from otolith.publishing.reader_sessions import QUERY_TIMEOUT
 from otolith.publishing.received_history import ReceivedHistory
 from otolith.publishing.zenoh_session import EVENT, REPORT
@@ -50,8 +50,16 @@ class _Asking:
         return found
 
 
-def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> ReceivedHistory:
-    """Return the history of a machine; ``ask`` returns what daemons answer to a selector, with a limit."""
+def past_of(
+    ask: Ask,
+    query: PastQuery,
+    latest: ReportDocument | None,
+    reader: tuple[Language | None, str | None] = (None, None),
+) -> ReceivedHistory:
+    """Return the history of a machine in the language and zone of its ``reader``, by default in those of the machine.
+
+    ``ask`` returns what daemons answer to a selector, with a limit.
+    """
     pieces, ask = tuple(_pieces(query)), _Asking(ask)
     key = REPORT.under(query.site, query.machine)
     selectors = [f"{key}?_time=[{_moment(begin)}..{_moment(end)}];limit=1" for begin, end in pieces]
@@ -62,7 +70,8 @@ def past_of(ask: Ask, query: PastQuery, latest: ReportDocument | None) -> Receiv
         reports[latest.window.end] = latest
     whole = f"{EVENT.under(query.site, query.machine)}?_time=[{_moment(query.since)}..{_moment(query.until)}]"
     events = list(_events(ask(whole, MAX_EVENTS)))
-    return ReceivedHistory(query.site, query.machine, [reports[end] for end in sorted(reports)], events)
+    ordered = [reports[end] for end in sorted(reports)]
+    return ReceivedHistory(query.site, query.machine, ordered, events, reader)
 
 
 def _pieces(query: PastQuery) -> Iterator[tuple[float, float]]:

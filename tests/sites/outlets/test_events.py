@@ -8,6 +8,7 @@ import smtplib
 import ssl
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith.health.limits import Level
+from otolith.health.text import event_in
 from otolith.site.known import Knowledge
 from otolith.site.outlets import mail
 from otolith.site.outlets import notices as notices_module
@@ -170,7 +172,8 @@ def test_an_e_mail_says_state_machine_what_since_when_and_what_to_do(mailbox: Ma
 
 
 def test_an_e_mail_is_in_the_language_of_the_site(mailbox: MailRig) -> None:
-    mailing(mailbox, "de").send([], [], deque([notice()]))
+    own = notice()
+    mailing(mailbox, "de").send([], [], deque([replace(own, event=event_in(own.event, "de"))]))
     (message,) = mailbox.messages()
     assert "HANDELN" in message["subject"]
     assert "Was zu tun ist" in message.get_content()

@@ -1,17 +1,22 @@
 """What the thread of an outlet keeps in mind: who is gone, what was refused, and whether anything was tried."""
 
+import ssl
 import threading
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path
 from typing import cast
 
 import pytest
 
+from otolith.health.schema import Language
 from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.metrics import exposition
 from otolith.site.outlets import runner
-from otolith.site.outlets.base import MachineView, Notice, OutletError
+from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
+from otolith.site.outlets.mail import Mail
+from otolith.site.outlets.options import MailOutlet
 from otolith.site.outlets.runner import OutletRunner
 from tests.sites.machines import raised, report_of, sent
 from tests.storage.histories import START
@@ -62,8 +67,33 @@ def known(*names: str) -> Knowledge:
     return knowledge
 
 
-def running(outlet: Scripted, works: Works) -> OutletRunner:
-    return OutletRunner("own", outlet, cast("Collector", works), "en", 60)
+def running(outlet: Scripted, works: Works, language: Language | None = "en", zone: str | None = None) -> OutletRunner:
+    setup = OutletSetup(Path(), "Works", language, zone)
+    return OutletRunner("own", outlet, cast("Collector", works), setup, 60)
+
+
+@pytest.mark.parametrize(
+    ("language", "zone", "condition", "moment"),
+    [("de", "Asia/Tokyo", "Unwucht der Welle", "07:13:20"), (None, None, "unbalanced shaft", "22:13:20")],
+)
+def test_views_and_notices_are_in_language_and_zone_of_the_site(
+    language: Language | None, zone: str | None, condition: str, moment: str
+) -> None:
+    own = raised().model_copy(update={
+        "condition": "unbalanced shaft", "condition_id": "unbalance", "timezone": "UTC", "part": "shaft"})  # fmt: skip
+    knowledge = Knowledge()
+    knowledge.take(*sent(report_of("a", events=(own,))), START)
+    each = running(Scripted(), Works(knowledge), language, zone)
+    view = each._view(next(iter(knowledge)), START)
+    assert view is not None
+    assert view.report is not None
+    event = each._reworded(Notice("hall-1", "a", Told.RAISED, own)).event
+    assert condition in view.what
+    assert [row.condition for row in (*view.report.open_events, event)] == [condition, condition]
+    letter = Mail(MailOutlet(host="h", sender="a@b.example", to=("c@d.example",)), "", ssl.create_default_context(),
+                  OutletSetup(Path(), "Works"))._message([Notice("hall-1", "a", Told.RAISED, event)])  # fmt: skip
+    assert condition in letter["subject"]
+    assert moment in letter.get_content()
 
 
 def test_a_machine_that_is_gone_while_the_outlet_fails_is_told_to_be_gone() -> None:

@@ -19,7 +19,7 @@ from rich.text import Text
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import drain
 from otolith.cli.console import Localised, Terminal
-from otolith.cli.machines import last_spoken
+from otolith.cli.machines import last_reports
 from otolith.cli.terminal import echo
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
@@ -407,13 +407,13 @@ def watch_reports(
 
     with Subscriber(connection, receive, machine, after=after) as subscriber:
         try:
-            spoken = () if connection.endpoints else tuple(last_spoken(machine))  # of the daemons of this computer
+            known = () if connection.endpoints else tuple(last_reports(machine))  # of the daemons of this computer
 
             begun = time.monotonic()
 
             def state() -> str:
                 is_alone = not (subscriber.connected or subscriber.order.keys)
-                return waiting_text(time.monotonic() - begun, spoken) if is_alone and spoken else subscriber.state()
+                return waiting_text(time.monotonic() - begun, known) if is_alone and known else subscriber.state()
 
             if as_json:
                 _stream(texts, subscriber, state, stopped)
@@ -427,11 +427,11 @@ def watch_reports(
             ended.set()
 
 
-def waiting_text(seconds: float, spoken: Iterable[str]) -> str:
-    """Return what is waited for since ``seconds`` while no daemon answers; ``spoken`` says of which one it was last."""
+def waiting_text(seconds: float, known: Iterable[str]) -> str:
+    """Return what is waited for since ``seconds`` while no daemon answers, after the lines ``known``."""
     if seconds < FIRST_ANSWER:
         return "looking for daemons of this computer ..."
-    return PARTS.join(["no daemon runs", *spoken])
+    return PARTS.join(["no daemon runs", *known])
 
 
 def _stream(

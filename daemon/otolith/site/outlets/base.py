@@ -100,7 +100,8 @@ class OutletSetup:
 
     folder: Path  # Of the file of the site
     title: str
-    language: Language
+    language: Language | None = None  # By default that of each machine, and English for texts about the site
+    zone: str | None = None  # By default that of each machine
 
 
 Build = Callable[[Any, OutletSetup], Outlet]

@@ -8,7 +8,7 @@ from email.message import EmailMessage
 from email.utils import formatdate, make_msgid
 
 from otolith.health.text import texts_in
-from otolith.health.times import moment_text
+from otolith.health.times import in_local_time, moment_text
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.connections import failure, tls_context
 from otolith.site.outlets.options import MailOutlet
@@ -62,16 +62,17 @@ class Mail:
         return message
 
     def _title(self, notice: Notice) -> str:
-        texts, event = texts_in(self._setup.language), notice.event
+        texts, event = texts_in(notice.event.language), notice.event
         word = texts.translated("OK" if notice.told is Told.CLEARED else event.state)
         return f"{word} {notice.machine}: {texts.part(event.part)}: {event.condition}"
 
     def _lines(self, notice: Notice) -> Sequence[str]:
-        words, event = words_in(self._setup.language), notice.event
+        words, event = words_in(notice.event.language), notice.event
         at = moment_text(event.since if event.end is None else event.end, event.timezone)
         what = f"{words['what_to_do']}: {event.advice}"
         is_open = notice.told is not Told.CLEARED and event.advice
-        own = (self._title(notice), f"{notice.site}, {at}", event.text, *((what,) if is_open else ()))
+        text = texts_in(event.language).decimals(in_local_time(event.text, event.timezone))
+        own = (self._title(notice), f"{notice.site}, {at}", text, *((what,) if is_open else ()))
         return [_short(visible(line)) for line in own]
 
     def _send(self, message: EmailMessage) -> None:

@@ -227,4 +227,4 @@ def build(options: MqttOutlet, setup: OutletSetup) -> MqttPublisher:
     secret = password(None if options.password_file is None else setup.folder / options.password_file)
     pair = (options.certificate, options.key)
     tls = tls_context(setup.folder, options.ca, pair) if options.tls else None
-    return MqttPublisher(options, secret, tls, setup.language)
+    return MqttPublisher(options, secret, tls, setup.language or "en")

@@ -184,7 +184,7 @@ class OpcuaServer:
             await node.write_value(_value(last.Value.Value if last.Value else None, ua.VariantType.Double, code))
 
     def _title(self, event: Any) -> str:
-        texts = texts_in(self._setup.language)
+        texts = texts_in(event.language)
         return _plain(visible(f"{texts.translated(event.state)} {texts.part(event.part)}: {event.condition}"))
 
     async def _show_parameters(

@@ -4,14 +4,14 @@ import logging
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from otolith.health.limits import Level
-from otolith.health.schema import Language
+from otolith.health.text import event_in, report_in
 from otolith.site.cards import card_of
 from otolith.site.collector import Collector
 from otolith.site.known import KnownMachine
-from otolith.site.outlets.base import MachineView, Notice, Outlet, OutletError
+from otolith.site.outlets.base import MachineView, Notice, Outlet, OutletError, OutletSetup
 from otolith.site.outlets.notices import Notices, RateLimit
 
 log = logging.getLogger(__name__)
@@ -40,10 +40,10 @@ class OutletStatus:
 class OutletRunner:
     """The thread of an outlet."""
 
-    def __init__(self, name: str, outlet: Outlet, collector: Collector, language: Language, per_hour: int) -> None:
-        """``per_hour`` bounds its notices."""
+    def __init__(self, name: str, outlet: Outlet, collector: Collector, setup: OutletSetup, per_hour: int) -> None:
+        """``per_hour`` bounds its notices; their texts are in language and zone of ``setup``."""
         self.status = OutletStatus(name)
-        self._outlet, self._collector, self._language = outlet, collector, language
+        self._outlet, self._collector, self._setup = outlet, collector, setup
         self._notices, self._limit = Notices(time.time()), RateLimit(per_hour)
         self._pending: deque[Notice] = deque()
         self._dropped = 0
@@ -92,7 +92,7 @@ class OutletRunner:
         now = time.time()
         with self._collector.lock:
             machines = list(self._collector.knowledge)
-            new = self._notices.take(machines)
+            new = [self._reworded(notice) for notice in self._notices.take(machines)]
             changed = [view for machine in machines if (view := self._view(machine, now)) is not None]
         self._pending.extend(self._limit.passes(new, now))
         while len(self._pending) > MAX_PENDING:
@@ -116,14 +116,21 @@ class OutletRunner:
         self._shown |= {view.key: view.revision for view in changed}
         return is_tried
 
+    def _reworded(self, notice: Notice) -> Notice:
+        """Return a notice in language and zone of the site."""
+        event, setup = notice.event, self._setup
+        return replace(notice, event=event_in(event, setup.language, setup.zone))
+
     def _view(self, machine: KnownMachine, now: float) -> MachineView | None:
         """Return a machine, None if it was passed on as it is."""
         state, is_silent = machine.state(now), machine.is_silent(now)
         revision = (machine.revision, state, is_silent)
         if self._shown.get(f"{machine.site}/{machine.name}") == revision:
             return None
-        card = card_of(machine, now, self._language)
-        report = None if is_silent else machine.report
+        report, setup = machine.report, self._setup
+        language = setup.language or (report.health.language if report and report.health else "en")
+        card = card_of(machine, now, language, setup.zone)
+        report = None if is_silent or report is None else report_in(report, setup.language, setup.zone)
         health = report.health if report is not None else None
         since = None if state is Level.NO_DATA or health is None else health.since
         return MachineView(

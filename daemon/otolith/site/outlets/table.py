@@ -56,7 +56,7 @@ def runners_of(
                 if file is not None:
                     Context(file).fail(("outlets", name, *error.key[1:]), str(error))
                 raise
-            runners.append(OutletRunner(name, outlet, collector, setup.language, options.per_hour))
+            runners.append(OutletRunner(name, outlet, collector, setup, options.per_hour))
     return runners
 
 
