@@ -9,6 +9,7 @@ from pathlib import Path
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, HealthDocument, ParameterDocument, ReportDocument, Status
 from otolith.publishing.publisher import Published, Publisher
+from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import close_session, session
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_writer import Bounds, HistoryWriter
@@ -55,12 +56,12 @@ def sent(report: ReportDocument) -> tuple[str, bytes]:
 class Daemon:
     """What a daemon does with its reports: it numbers, keeps and publishes them."""
 
-    def __init__(self, folder: Path, machine: str, endpoint: str) -> None:
+    def __init__(self, folder: Path, machine: str, endpoint: str = "", access: Access = Access()) -> None:  # noqa: B008 - immutable
         self.machine, self.endpoint = machine, endpoint
         self._writer = HistoryWriter(folder / f"{SITE}.{machine}{SUFFIX}", BOUNDS)
         self._numbers, _ = self._writer.open(time.time())
         self._writer.start()
-        self._publisher = Publisher([Published(SITE, machine, self._writer)], [endpoint])
+        self._publisher = Publisher([Published(SITE, machine, self._writer)], [endpoint] if endpoint else [], access)
 
     def keep(self, report: ReportDocument) -> ReportDocument:
         """Number a report and keep it."""
