@@ -23,6 +23,7 @@ BREACHES = {
     "adapt reads a clock": ("daemon/otolith/adaptation/adapt.py", "import time"),
     "estimation opens a file": ("daemon/otolith/estimation/minimisers.py", "import pathlib"),
     "a machine of the service opens a socket": ("daemon/otolith/runtime/hall/machine.py", "import socket"),
+    "the replay of a segment reads a clock": ("daemon/otolith/runtime/segment.py", "import time"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
     "the twin imports the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
     "the site reads a state directory": ("daemon/otolith/site/hall.py", "import otolith.storage.state_store"),

@@ -338,7 +338,7 @@ def check(machine: LoadedMachine, table: Path, log: Log, work: Work) -> list[Win
     rows, span = log.table.count("\n"), machine.records
     with open_recorded(machine, table) as opened:
         replay = Replay(machine, Marked(opened, log.chunk, log.marks), lambda: len(windows) > MAX_WINDOWS)
-        replay._wait = lambda window: windows.append((replay._playback.counts.segments, window))
+        replay._wait = lambda window: windows.append((replay._player.playback.counts.segments, window))
         try:
             for report in replay.reports():
                 documents.append(ReportDocument.from_json(report.document.to_json()))
@@ -347,10 +347,10 @@ def check(machine: LoadedMachine, table: Path, log: Log, work: Work) -> list[Win
             refusal = str(error)
         replay.summary()
         replay.warnings()
-    counts = replay._playback.counts
+    counts = replay._player.playback.counts
     assert not refusal or str(table) in refusal
     assert not refusal or not documents or "decreases" in refusal
-    assert replay._missed == 0
+    assert replay._player.windows_missed == 0
     assert_follow(windows, machine.file.window.sample_period)
     for _, window in windows:
         assert_bounded(window, rows, span)

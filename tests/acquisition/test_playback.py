@@ -5,8 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from otolith.acquisition.playback import Playback
+from otolith.acquisition.playback import Playback, PlaybackCounts
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.window import Array, Window
 from otolith_drivers.replay.readers import Rows
 from tests.acquisition.test_windower import CYCLIC, LIMITS, PERIOD, RECORDS, cut_all
@@ -67,3 +68,34 @@ def test_windows_do_not_depend_on_chunks() -> None:
     assert whole.counts == pieces.counts
     assert whole.counts.gaps == 2
     assert whole.counts.longest_gap == pytest.approx(200.0, abs=0.2)
+
+
+@pytest.mark.parametrize("blank", ["", "b"])
+def test_windows_do_not_depend_on_where_a_playback_is_continued(blank: str) -> None:
+    """Twenty samples come in the time of a record, so rings for one each would lose most of a window.
+
+    Without a sample of one signal, the first window begins at the moment of a check.
+    """
+    times = 5.0 + np.arange(6000.0) * PERIOD / 20.37
+    log = rows(times, np.sin(times))
+    log.columns.update({blank: np.full(len(times), np.nan)} if blank else {})
+    plans = (SignalPlan("a"), SignalPlan("b"))
+
+    def continued(*cuts: int) -> tuple[list[Window], PlaybackCounts]:
+        windows, playback = [], Playback(plans, RECORDS, PERIOD, LIMITS)
+        for first, last in pairwise([0, *cuts, len(times)]):
+            part = log.part(slice(first, last))
+            windows += playback.windows(part) if last < len(times) else played(playback, part)
+            before, playback = playback, Playback(plans, RECORDS, PERIOD, LIMITS)
+            playback.restore(before.state)
+        return windows, playback.counts
+
+    at_once, counts = continued()
+    assert len(at_once) == 5
+    assert counts.lost == 0
+    for cuts in ((1,), (6, 2500), tuple(range(990, 1070)), (5999,)):
+        again, others = continued(*cuts)
+        assert counts == others
+        for one, other in zip(at_once, again, strict=True):
+            assert (one.start, one.index, one.quality) == (other.start, other.index, other.quality)
+            assert np.array_equal(one.values, other.values)

@@ -37,13 +37,12 @@ from otolith.storage.evidence import (
     MACHINE,
     MAX_WAITING_BUNDLES,
     TWIN,
-    Decoder,
     EvidenceWriter,
-    encoded,
     has_evidence,
     public_text,
     read_bundle,
 )
+from otolith.storage.exact_json import Decoder, encoded
 from otolith.storage.learned_state import learned_state, restored
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario

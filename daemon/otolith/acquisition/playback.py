@@ -2,7 +2,8 @@
 
 The daemon's thread checks the rings at the moments of the wall clock. Here they are checked only when the result can
 change: half a sample period after the end of a window, when all on-time samples have come, and then with each new
-sample until the grace period ends. So the windows depend on the rows alone, not on how the rows are split into chunks.
+sample until the grace period ends. So the windows depend on the rows alone, not on how the rows are split into chunks;
+:class:`PlaybackState` is all that later windows need of earlier rows.
 :class:`RecordingStatistics` counts how the rows were sampled, in one pass and in bounded memory.
 """
 
@@ -15,15 +16,16 @@ import numpy as np
 
 from otolith.acquisition.cutting import cut
 from otolith.acquisition.quality import QualityLimits
-from otolith.acquisition.ring import Rings
+from otolith.acquisition.ring import Rings, RingsState
 from otolith.acquisition.samples import SignalPlan, renewal
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.acquisition.windower import Windower
+from otolith.acquisition.windower import Windower, WindowerState
 from otolith_drivers.replay.readers import Integers, Rows
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 REPLAY_RING_WINDOWS = 16  # windows that the rings of a replay hold
 MAX_RING_SAMPLES = 1 << 20  # samples of each signal, however many a window has
+STEP_ROWS = 1 << 9  # rows at the begin whose median step says how many samples a window has
 MAX_SILENT_WINDOWS = 1  # window lengths; a longer time without any row is skipped
 CONFIRMING_ROWS = 5  # rows that must continue from an earlier time, so that one wrong time is no new recording
 MAX_KEPT = 8192  # intervals and values of a signal that are kept; of more, as many are chosen at random
@@ -39,20 +41,20 @@ class SegmentFinder:
     def __init__(self, step_back: float) -> None:
         """Time starts again where it steps back by more than ``step_back`` s."""
         self._step_back = step_back
-        self._held: Rows | None = None
-        self._clock = -np.inf  # latest time of the present segment, s
+        self.held: Rows | None = None  # The rows that wait for those that confirm them
+        self.clock = -math.inf  # Latest time of the present segment, s
 
     def mark(self, rows: Rows) -> Iterator[Rows]:
         """Yield rows with their segments marked; the last few wait for those that confirm them."""
-        rows = rows if self._held is None else self._held.followed_by(rows)
+        rows = rows if self.held is None else self.held.followed_by(rows)
         ready = len(rows.times) - CONFIRMING_ROWS
-        self._held = rows if ready <= 0 else rows.part(slice(ready, None))
+        self.held = rows if ready <= 0 else rows.part(slice(ready, None))
         if ready > 0:
             yield self._marked(rows, ready)
 
     def rest(self) -> Iterator[Rows]:
         """Yield the rows that still wait."""
-        held, self._held = self._held, None
+        held, self.held = self.held, None
         if held is not None and len(held.times):
             yield self._marked(held, len(held.times))
 
@@ -63,13 +65,13 @@ class SegmentFinder:
             marks = np.flatnonzero(begins[at:count])
             until = at + int(marks[0]) if len(marks) else count
             if until == at:
-                self._clock = float(times[at])
+                self.clock = float(times[at])
                 until = at + int(marks[1]) if len(marks) > 1 else count
-            clock = np.maximum.accumulate(np.maximum(times[at:until], self._clock))
+            clock = np.maximum.accumulate(np.maximum(times[at:until], self.clock))
             behind = np.flatnonzero(times[at:until] < clock - self._step_back)
             again = next((at + int(index) for index in behind if self._starts_again(times, at + int(index))), None)
             if again is None:
-                self._clock = float(clock[-1])
+                self.clock = float(clock[-1])
                 at = until
             else:
                 begins[again] = True
@@ -102,6 +104,24 @@ class PlaybackCounts:
     stale: int = 0  # Readings of a register that had not been renewed, which were not used
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaybackState:
+    """All that the windows of later rows need of earlier ones, so that a playback can be continued bit for bit."""
+
+    windower: WindowerState
+    rings: RingsState
+    counts: PlaybackCounts
+    unmarked: Rows | None  # Rows whose segments are not known yet
+    segment_clock: float  # Latest time of the present segment up to them, s
+    waiting: Rows | None  # The first rows, until their step is known
+    step: float | None  # Median of the first rows, s
+    windows: int
+    clock: float  # s
+    begun: float  # s
+    checked: float  # s
+    check: float | None  # s
+
+
 def median_step(times: Array) -> float:
     """Return the median time between rows in s, without steps back; infinity if no step is positive."""
     steps = np.diff(times)
@@ -129,18 +149,59 @@ class Playback:
         self._windows = 0
         self._clock = -math.inf  # latest time of a delivered row
         self._begun = self._checked = -math.inf
-        self._step = math.inf
+        self._check: float | None = None  # When to check the rings, once all rows before are delivered
+        self._step: float | None = None
+        self._waiting: Rows | None = None
+
+    @property
+    def state(self) -> PlaybackState:
+        """All that the windows of later rows need; between two calls of :meth:`windows`."""
+        return PlaybackState(
+            self.windower.state,
+            self._rings.state,
+            replace(self.counts),
+            self._segments.held,
+            self._segments.clock,
+            self._waiting,
+            self._step,
+            self._windows,
+            self._clock,
+            self._begun,
+            self._checked,
+            self._check,
+        )
+
+    def restore(self, state: PlaybackState) -> None:
+        """Continue ``state``, which must be of the same plans, limits and signals."""
+        self.windower.restore(state.windower)
+        self._rings.restore(state.rings)
+        self.counts = replace(state.counts)
+        self._segments.held, self._segments.clock = state.unmarked, state.segment_clock
+        self._waiting, self._step, self._windows = state.waiting, state.step, state.windows
+        self._clock, self._begun, self._checked, self._check = state.clock, state.begun, state.checked, state.check
 
     def windows(self, rows: Rows) -> Iterator[Window]:
         """Yield the windows that ``rows`` complete; the generator must be exhausted."""
         for part in self._segments.mark(rows):
-            yield from self._windows_of(part)
+            yield from self._windows_with_step(part, is_last=False)
 
     def rest(self) -> Iterator[Window]:
         """Yield the windows that are complete if no further row comes."""
         for part in self._segments.rest():
-            yield from self._windows_of(part)
+            yield from self._windows_with_step(part, is_last=True)
         yield from self._complete()
+
+    def _windows_with_step(self, rows: Rows, *, is_last: bool) -> Iterator[Window]:
+        """Yield the windows of ``rows`` once the step of the first ones is known."""
+        if self._step is None:
+            rows = rows if self._waiting is None else self._waiting.followed_by(rows)
+            ends = np.flatnonzero(rows.begins[1:]) + 1
+            count = int(ends[0]) if len(ends) else len(rows.times)
+            self._waiting = rows if count < STEP_ROWS and not len(ends) and not is_last else None
+            if self._waiting is not None:
+                return
+            self._step = median_step(rows.times[: min(count, STEP_ROWS)])
+        yield from self._windows_of(rows)
 
     def _windows_of(self, rows: Rows) -> Iterator[Window]:
         begins = [int(row) for row in np.flatnonzero(rows.begins)]
@@ -159,15 +220,17 @@ class Playback:
         while at < len(clock):
             if math.isinf(self._begun):
                 self._restart(rows, at)
-            elif clock[at] - self._clock > MAX_SILENT_WINDOWS * self.windower.length:
-                yield from self._complete()
-                self._skip_gap(float(clock[at]))
-            check = self._next_check(float(clock[at]))
-            until = at + int(np.searchsorted(clock[at:], check))
+            if self._check is None:
+                if clock[at] - self._clock > MAX_SILENT_WINDOWS * self.windower.length:
+                    yield from self._complete()
+                    self._skip_gap(float(clock[at]))
+                self._check = self._next_check(float(clock[at]))
+            until = at + int(np.searchsorted(clock[at:], self._check))
             self._deliver(rows, slice(at, until), clock)
             at = until
             if at < len(clock):
-                yield from self._cut_due(check)
+                yield from self._cut_due(self._check)
+                self._check = None
 
     def _complete(self) -> Iterator[Window]:
         if self._begun > -math.inf:
@@ -183,12 +246,11 @@ class Playback:
         """Begin anew with row ``at``, like a daemon that is started then."""
         old = self.windower
         self.windower = Windower(self._plans, old.records, old.sample_period, self._limits)
-        if math.isinf(self._step):
-            self._step = median_step(rows.times)
-        step = min(old.sample_period, self._step)
+        step = min(old.sample_period, self._step or math.inf)
         held = REPLAY_RING_WINDOWS * old.length + max(plan.delay for plan in self._plans)
         self._rings = Rings(old.signals, int(min(held / step, MAX_RING_SAMPLES)), self._observed)
         self._clock = self._begun = self._checked = float(rows.times[at])
+        self._check = None
 
     def _skip_gap(self, following: float) -> None:
         """Let the next window start with the row at ``following`` (s); what commands hold is kept."""

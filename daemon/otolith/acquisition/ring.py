@@ -23,6 +23,29 @@ class RingCounters:
     unknown: int = 0  # Samples of signals that have no ring
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RingState:
+    """All of a ring, so that it can be continued."""
+
+    capacity: int
+    times: Array  # (n,) s, by their slots
+    values: Array  # (n,)
+    count: int
+    read_up_to: float  # s
+    newest: float  # s
+    unordered_until: int
+    overwritten: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingsState:
+    """All of the rings of a machine, so that they can be continued."""
+
+    rings: Mapping[str, RingState]  # By signal
+    received: int
+    unknown: int
+
+
 class Ring:
     """The last ``capacity`` samples of one signal, in the order of their arrival."""
 
@@ -34,6 +57,24 @@ class Ring:
         self._newest = -math.inf
         self._unordered_until = 0  # count up to which a sample may be older than one that came before it
         self.overwritten = 0
+
+    @property
+    def state(self) -> RingState:
+        """All of the ring, with copies of its samples."""
+        held = min(self._count, len(self._times))
+        samples = self._times[:held].copy(), self._values[:held].copy()
+        counts = self._count, self._read_up_to, self._newest, self._unordered_until, self.overwritten
+        return RingState(len(self._times), *samples, *counts)
+
+    @classmethod
+    def of(cls, state: RingState) -> "Ring":
+        """Return a ring that continues ``state``."""
+        ring = cls(state.capacity)
+        held = len(state.times)
+        ring._times[:held], ring._values[:held] = state.times, state.values
+        ring._count, ring._read_up_to, ring._newest = state.count, state.read_up_to, state.newest
+        ring._unordered_until, ring.overwritten = state.unordered_until, state.overwritten
+        return ring
 
     def append(self, time: float, value: float) -> None:
         """Add a sample: ``time`` in s, ``value`` NaN where the source had no reading."""
@@ -108,6 +149,18 @@ class Rings:
         self._rings = {signal: Ring(capacity) for signal in (*signals, *observed)}
         self._received = 0
         self._unknown = 0
+
+    @property
+    def state(self) -> RingsState:
+        """All of the rings, with copies of their samples."""
+        with self._lock:
+            return RingsState({name: ring.state for name, ring in self._rings.items()}, self._received, self._unknown)
+
+    def restore(self, state: RingsState) -> None:
+        """Continue ``state``, which must have the same signals."""
+        with self._lock:
+            self._rings = {name: Ring.of(state.rings[name]) for name in self._rings}
+            self._received, self._unknown = state.received, state.unknown
 
     def deliver(self, samples: Sequence[Sample]) -> None:
         """Take the samples of a driver; called from the driver's thread."""

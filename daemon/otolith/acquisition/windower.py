@@ -66,6 +66,19 @@ class RawWindow:
     """Mean over the window of each signal that only the judgement of the estimates needs."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowerState:
+    """All of a windower but its plans and limits, so that it can be continued."""
+
+    records: int
+    sample_period: float  # s
+    latency: float  # s
+    grace: float  # s
+    intervals: Mapping[str, float]  # By signal, s
+    start: float  # s
+    index: int
+
+
 class Windower:
     """Tracks where the next window begins. Times are seconds on the monotonic clock, given by the caller."""
 
@@ -84,6 +97,18 @@ class Windower:
         self._intervals: dict[str, float] = {}
         self._start = math.inf
         self._index = 0
+
+    @property
+    def state(self) -> WindowerState:
+        """All but plans and limits."""
+        grid = self.records, self.sample_period, self.latency, self.grace
+        return WindowerState(*grid, dict(self._intervals), self._start, self._index)
+
+    def restore(self, state: WindowerState) -> None:
+        """Continue ``state``, which must be of the same plans and limits."""
+        self.records, self.sample_period = state.records, state.sample_period
+        self.latency, self.grace, self._intervals = state.latency, state.grace, dict(state.intervals)
+        self._start, self._index = state.start, state.index
 
     @property
     def length(self) -> float:

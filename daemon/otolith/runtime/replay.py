@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, RecordingStatistics, median_step
+from otolith.acquisition.playback import MAX_SILENT_WINDOWS, RecordingStatistics, median_step
 from otolith.acquisition.quality import is_of_calendar, time_text
-from otolith.acquisition.window import Verdict, Window
-from otolith.adaptation.state import initial_state
-from otolith.health.schema import CountersDocument, Report
+from otolith.acquisition.window import Window
+from otolith.adaptation.state import AdaptationState
+from otolith.health.schema import Report
 from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, RecordedMachine
 from otolith.machine_file import DriverConfig, driver_configs, signal_units
-from otolith.runtime.worker import perform
+from otolith.runtime.segment import Player, first_state
 from otolith.storage.recording_files import MIN_FREE_BYTES, recording_file, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
@@ -229,20 +229,23 @@ class Replay:
 
         With ``timing`` the reports have computing times, so that they differ from run to run.
         """
-        identity, window = machine.file.machine, machine.file.window
-        self.state = initial_state(identity.name, identity.site, machine.problem, machine.plan)
-        """State after the last window."""
         self.statistics = RecordingStatistics(machine.twin.signals)  # Of the rows that were read so far
         self.progress = 0.0  # Share of the data in the windows so far, 0 to 1
         self._data = data
         self._stopped = stopped
         self._wait = wait
-        self._timing = timing
-        self._length = window.length
-        self._files = FileTimes(window.length)
-        plans = machine.plans(data.sampling)
-        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits, machine.observed)
-        self._windows = self._windows_bad = self._missed = 0
+        self._length = machine.file.window.length
+        self._files = FileTimes(self._length)
+        self._player = Player(machine, first_state(machine, data.sampling), timing=timing)
+
+    @property
+    def state(self) -> AdaptationState:
+        """What was learned up to the last window."""
+        return self._player.adaptation
+
+    @state.setter
+    def state(self, state: AdaptationState) -> None:
+        self._player.adaptation = state
 
     def reports(self) -> Iterator[Report]:
         """Yield the report of every window in order, with the counters at its end.
@@ -255,12 +258,12 @@ class Replay:
                 self._wait(window)
                 if self._stopped():
                     return
-            report = self._adapt(window)
+            report = self._player.adapt(window, self._data.lost)
             if report is not None:
                 yield report
             if self._stopped():
                 return
-        if not self._windows and not self._stopped():
+        if not self._player.windows and not self._stopped():
             raise ConfigurationError(f"{self._data.path}: {self._why_no_window()}")
 
     def windows(self) -> Iterator[Window]:
@@ -273,9 +276,9 @@ class Replay:
                 self._check_times(rows)
             self.statistics.add(rows)
             begun, before = before, self._data.progress
-            yield from self._with_progress(self._playback.windows(rows), rows, begun)
+            yield from self._with_progress(self._player.playback.windows(rows), rows, begun)
         if rows is not None:
-            yield from self._with_progress(self._playback.rest(), rows, begun)
+            yield from self._with_progress(self._player.playback.rest(), rows, begun)
         if not self._stopped():
             self.progress = 1.0
 
@@ -308,40 +311,16 @@ class Replay:
             remedy += f"; {_standstill(rows)}, so write t with all its digits"
         raise ConfigurationError(f"{self._data.file}: {rate}: {remedy}")
 
-    def _adapt(self, window: Window) -> Report | None:
-        """Return the report of a window, or None if the adaptation failed, which costs this window only."""
-        self._windows += 1
-        self._windows_bad += window.quality.verdict is Verdict.BAD
-        result = perform(self.state, window)
-        self.state = result.state
-        self._playback.windower.records = result.state.records
-        if result.report is None:
-            self._missed += 1
-            return None
-        counts = self._playback.counts
-        seconds = result.seconds if self._timing else None
-        cost = result.report.document.cost.model_copy(update={"seconds": seconds})
-        counters = CountersDocument(
-            received=counts.received,
-            bad=counts.bad,
-            lost=counts.lost + self._data.lost,
-            windows=self._windows,
-            windows_bad=self._windows_bad,
-            windows_missed=self._missed,
-        )
-        document = result.report.document.model_copy(update={"counters": counters, "cost": cost})
-        return Report(document, result.report.traces)
-
     def summary(self) -> str:
         """Return in one line how much was read."""
-        counts = self._playback.counts
+        counts = self._player.playback.counts
         first, *rest = self._data.summary_lines()
         parts = ", ".join([first, f"{counts.reordered} reordered", *rest])
         return f"{parts}; {counted(counts.received, 'sample')}, {counts.lost + self._data.lost} lost"
 
     def warnings(self) -> list[str]:
         """Return what a user must know of the file before trusting the reports, one sentence each."""
-        counts, unused = self._playback.counts, self._playback.unused_seconds
+        counts, unused = self._player.playback.counts, self._player.playback.unused_seconds
         lines = [f"interrupted after {self.progress:.0%} of the data"] if self._stopped() else []
         lines += [*self._data.warnings(), *self._files.warnings()]
         if counts.first_late is not None:
@@ -358,14 +337,14 @@ class Replay:
             lines.append(f"samples at the time of another one, not used twice: {counts.repeated}")
         if counts.stale:
             lines.append(f"readings of registers that had not been renewed, not used: {counts.stale}")
-        if self._missed:
-            lines.append(f"windows that could not be computed: {self._missed}")
+        if self._player.windows_missed:
+            lines.append(f"windows that could not be computed: {self._player.windows_missed}")
         if unused >= self._length / 2:
             lines.append(f"the last {unused:.3g} s are too short for a window of {self._length:g} s")
         return lines
 
     def _why_no_window(self) -> str:
-        rows = self._playback.counts.rows
+        rows = self._player.playback.counts.rows
         if rows > 1 and self.statistics.first == self.statistics.last:
             return (
                 f"all {rows} rows have the same time, {time_text(self.statistics.first)}: write t with all its digits"
