@@ -82,7 +82,7 @@ def test_windows_do_not_depend_on_where_a_playback_is_continued(blank: str) -> N
     plans = (SignalPlan("a"), SignalPlan("b"))
 
     def continued(*cuts: int) -> tuple[list[Window], PlaybackCounts]:
-        windows, playback = [], Playback(plans, RECORDS, PERIOD, LIMITS)
+        windows, playback = list[Window](), Playback(plans, RECORDS, PERIOD, LIMITS)
         for first, last in pairwise([0, *cuts, len(times)]):
             part = log.part(slice(first, last))
             windows += playback.windows(part) if last < len(times) else played(playback, part)

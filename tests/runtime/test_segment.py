@@ -12,6 +12,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import Replay, open_recorded
 from otolith.runtime.segment import ReplayState, Samples, first_state, replay_segment
 from otolith.storage.exact_json import Decoder, encoded
+from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario
 from otolith_drivers.replay.readers import Rows
 from tests.cli.replays import MACHINE, recorded, written
@@ -34,6 +35,7 @@ def machine() -> LoadedMachine:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """From 9 s on the shaft is unbalanced, which hypotheses compete to explain for three windows."""
     scenario = load_scenario(EXAMPLES / "scenarios" / "demo.toml")
+    assert isinstance(scenario, MotorScenario)
     unbalance = scenario.faults[1].model_copy(update={"start": 9.0})
     rows = recorded(scenario.model_copy(update={"faults": (unbalance,)}), WINDOWS)
     return written(tmp_path_factory.mktemp("data"), rows)

@@ -62,9 +62,16 @@ class Ring:
     def state(self) -> RingState:
         """All of the ring, with copies of its samples."""
         held = min(self._count, len(self._times))
-        samples = self._times[:held].copy(), self._values[:held].copy()
-        counts = self._count, self._read_up_to, self._newest, self._unordered_until, self.overwritten
-        return RingState(len(self._times), *samples, *counts)
+        return RingState(
+            len(self._times),
+            self._times[:held].copy(),
+            self._values[:held].copy(),
+            self._count,
+            self._read_up_to,
+            self._newest,
+            self._unordered_until,
+            self.overwritten,
+        )
 
     @classmethod
     def of(cls, state: RingState) -> "Ring":
