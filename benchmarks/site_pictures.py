@@ -37,8 +37,8 @@ def knowledge() -> tuple[Knowledge, float]:
 def page() -> str:
     """Return the page of the hall, with its style in it, for a browser without a server."""
     known, now = knowledge()
-    frame = {"title": "Works 2", "words": words_in("en"), "time": moment_text(now, ZONE), "refused": {}, "dropped": 0}
-    html = Hall(known, ZONE).page(now, "en", Filter(), "", {"language": "en", **frame})
+    frame = {"title": "Works 2", "words": words_in("en"), "time": moment_text(now, ZONE), "dropped": 0}
+    html = b"".join(Hall(known, ZONE).shown(now, "en").page(Filter(), "", frame)).decode()
     style = files("otolith.site").joinpath("pages", "site.css").read_text(encoding="utf-8")
     html = html.replace('<link rel="stylesheet" href="/site.css">', f"<style>{style}</style>")
     return html.replace('<script src="/site.js" defer></script>', "")

@@ -18,7 +18,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from otolith.health.limits import Level
 from otolith.health.schema import Status
 from otolith.publishing.zenoh_session import session
-from otolith.site.app import MAX_LIVE, MAX_QUERY, REFRESH
+from otolith.site.app import MAX_QUERY, REFRESH
+from otolith.site.serving.live import MAX_LIVE
 from otolith.site.words import words_in
 from tests.hostile import HOSTILE
 from tests.sites.machines import Daemon, Stranger, daemons, own_endpoint, raised, report_of, sent

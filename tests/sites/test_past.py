@@ -9,11 +9,12 @@ import pytest
 from starlette.requests import Request
 
 from otolith.publishing.reader_sessions import QUERY_TIMEOUT
-from otolith.site import app, past
+from otolith.site import past
 from otolith.site.app import SitePages
 from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.past import PARALLEL, PastQuery, past_of
+from otolith.site.serving import past_pages
 from otolith.site.settings import SiteFile
 from tests.sites.machines import report_of, sent
 from tests.storage.histories import MACHINE, SITE, START
@@ -26,6 +27,10 @@ class Works:
         self.knowledge, self.lock, self.asked = Knowledge(), threading.Lock(), 0
         self.dropped: Counter[str] = Counter()
         self.knowledge.take(*sent(report_of()), START)
+
+    def where(self, *_: str) -> str:
+        """Say that all are of one daemon."""
+        return ""
 
     def ask(self, *_: object) -> list[bytes]:
         """Answer nothing."""
@@ -70,7 +75,7 @@ def test_a_history_that_cannot_be_shown_is_named_as_such(monkeypatch: pytest.Mon
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(app, "received_page", fail)
+    monkeypatch.setattr(past_pages, "received_page", fail)
     pages = SitePages(cast("Collector", Works()), SiteFile())
     scope = {"type": "http", "method": "GET", "path": "/", "query_string": b"", "headers": [],
              "path_params": {"site": SITE, "machine": MACHINE}}  # fmt: skip

@@ -20,7 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from otolith.health.limits import Level
 from otolith.health.schema import CostDocument, DriverDocument
 from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
-from otolith.site.metrics import exposition
+from otolith.site.metrics import Metrics
 from otolith.site.outlets.runner import OutletStatus
 from otolith.site.outlets.table import OUTLETS
 from otolith.site.settings import SiteFile
@@ -37,7 +37,7 @@ PROMETHEUS, PROMTOOL, AMTOOL = (shutil.which(name) for name in ("prometheus", "p
 
 
 def scraped(knowledge: Knowledge, now: float = START) -> str:
-    return exposition(knowledge, {"queue": 1}, [OutletStatus("mqtt", is_tried=True)], now).decode()
+    return Metrics(knowledge).exposition({"queue": 1}, [OutletStatus("mqtt", is_tried=True)], now).decode()
 
 
 def known(count: int = 1, **update: Any) -> Knowledge:

@@ -91,11 +91,24 @@ class ReaderSessions:
         """Where it looks."""
         return tuple(self.endpoints or self._opened or local_sockets())
 
-    def get(self, selector: str, limit: int = MAX_REPLIES, max_bytes: float = math.inf) -> list[tuple[str, bytes]]:
-        """Return key and content of what answers a selector: at most ``limit``, and no more than ``max_bytes``."""
-        heard = self._opened.get(self._heard.get(selector.partition("?")[0].rpartition("/")[0], ""))
+    def where(self, machine: str) -> str:
+        """Return the endpoint where a machine was heard, by the prefix of its keys; empty if it was not."""
+        return self._heard.get(machine, "")
+
+    def get(
+        self,
+        selector: str,
+        limit: int = MAX_REPLIES,
+        max_bytes: float = math.inf,
+        refused: Callable[[], None] = lambda: None,
+    ) -> list[tuple[str, bytes]]:
+        """Return key and content of what answers a selector: at most ``limit``, and no more than ``max_bytes``.
+
+        ``refused`` is called if a daemon refuses to answer.
+        """
+        heard = self._opened.get(self.where(selector.partition("?")[0].rpartition("/")[0]))
         for each in (heard,) if heard is not None else tuple(self._opened.values()):
-            if found := list(islice(_answers(each, selector, max_bytes), limit)):
+            if found := list(islice(_answers(each, selector, max_bytes, refused), limit)):
                 return found
         return []
 
@@ -135,11 +148,14 @@ class ReaderSessions:
             self._heard[arrival.machine] = endpoint
 
 
-def _answers(opened: zenoh.Session, selector: str, max_bytes: float) -> Iterator[tuple[str, bytes]]:
+def _answers(
+    opened: zenoh.Session, selector: str, max_bytes: float, refused: Callable[[], None]
+) -> Iterator[tuple[str, bytes]]:
     none, size = zenoh.ConsolidationMode.NONE, 0  # by default only the latest message of a key would be passed on
     with contextlib.suppress(zenoh.ZError):  # the session was closed
         for reply in opened.get(selector, timeout=QUERY_TIMEOUT, consolidation=none):
             if reply.ok is None:
+                refused()
                 continue
             content = reply.ok.payload.to_bytes()
             size += len(content)

@@ -10,13 +10,13 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
 from otolith.publishing.reader_sessions import QUERY_TIMEOUT, Arrival, ReaderSessions
 from otolith.publishing.zenoh_config import MAX_MESSAGE_BYTES, Connection
-from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT
+from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, prefix
 from otolith.site.known import MAX_MACHINES, Knowledge
 
 log = logging.getLogger(__name__)
@@ -67,9 +67,13 @@ class Collector:
         """Whether a daemon or a router is connected."""
         return self._sessions.connected
 
-    def ask(self, selector: str, limit: int = MAX_REPLIES) -> list[bytes]:
-        """Return what daemons answer to a query: at most ``limit`` documents, none that is too large."""
-        return [content for _, content in self._sessions.get(selector, limit, MAX_ANSWER_BYTES)]
+    def where(self, site: str, machine: str) -> str:
+        """Return the endpoint of the daemon of a machine, or of its router; empty if it was not heard yet."""
+        return self._sessions.where(prefix(site, machine))
+
+    def ask(self, selector: str, limit: int, refused: Callable[[], None]) -> list[bytes]:
+        """Return what daemons answer to a query: at most ``limit`` documents, and no more than a few megabytes."""
+        return [content for _, content in self._sessions.get(selector, limit, MAX_ANSWER_BYTES, refused)]
 
     def _put(self, arrival: Arrival) -> None:
         try:

@@ -1,132 +1,129 @@
-"""What is known of the machines as metrics of Prometheus, in its text format and by its conventions of names."""
+"""What is known of the machines as metrics of Prometheus, in its text format and by its conventions of names.
 
-from collections import Counter
+The lines of a machine are written once after each change of it; a scrape only puts them together.
+"""
+
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-
 from otolith.health.limits import LEVELS, Level
-from otolith.health.schema import CountersDocument, ReportDocument
-from otolith.site.known import MAX_PARAMETERS, Knowledge, KnownMachine, RefusedFor
+from otolith.health.schema import CountersDocument
+from otolith.site.known import MAX_MACHINES, MAX_PARAMETERS, Knowledge, KnownMachine, RefusedFor
 from otolith.site.outlets.runner import OutletStatus
 
-CONTENT_TYPE = CONTENT_TYPE_LATEST
-MACHINE = ("site", "machine")
-PARAMETER = (*MACHINE, "parameter", "unit")
-VALUES = {
-    "value": "Estimate of a parameter.",
-    "low": "Lower end of the 95 % interval of a parameter.",
-    "high": "Upper end of the 95 % interval of a parameter.",
-    "limit": "Limit of a parameter that is nearest to its healthy value.",
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+GAUGES = {
+    "otolith_machine_state": "1 for the state that a machine is in, 0 for the others.",
+    "otolith_machine_up": "Whether reports of the machine come.",
+    "otolith_report_timestamp_seconds": "End of the window of the latest report, Unix time.",
+    "otolith_events_open": "Events that are not cleared.",
+    "otolith_report_latency_seconds": "From the end of a window to its report.",
+    "otolith_source_up": "Whether the connection to the machine is up.",
+    "otolith_parameter_value": "Estimate of a parameter.",
+    "otolith_parameter_low": "Lower end of the 95 % interval of a parameter.",
+    "otolith_parameter_high": "Upper end of the 95 % interval of a parameter.",
+    "otolith_parameter_limit": "Limit of a parameter that is nearest to its healthy value.",
 }
+VALUES = ("value", "low", "high", "limit")
+COUNTERS = {f"otolith_daemon_{name}_total": name for name in CountersDocument.model_fields}
+OUTLETS = {
+    "failures": "Tries of an outlet that failed.",
+    "sent": "Notices of events that an outlet passed on.",
+    "lost": "Notices that were dropped: above the limit per hour, after a failure, or refused.",
+}
+STATES = tuple((level, level.name.lower()) for level in LEVELS if level is not Level.HINT)
+ESCAPES = str.maketrans({"\\": r"\\", '"': r"\"", "\n": r"\n"})
+
+Lines = dict[str, str]
+"""Lines of a machine, by the name of their metric."""
 
 
-def exposition(knowledge: Knowledge, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float) -> bytes:
-    """Return the metrics as text; a machine of which nothing is known has a state, and no values."""
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Source(knowledge, dropped, outlets, now))
-    return generate_latest(registry)
+class Metrics:
+    """Writes metrics; the caller holds the lock of the knowledge."""
+
+    def __init__(self, knowledge: Knowledge) -> None:
+        self._knowledge = knowledge
+        self._written: dict[tuple[str, str], tuple[object, Lines]] = {}  # With what they depend on
+
+    def exposition(self, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float) -> bytes:
+        """Return the metrics as text; a machine of which nothing is known has a state, and no values."""
+        machines, parts = [self._lines(machine, now) for machine in self._knowledge], list[str]()
+        for name, text in GAUGES.items():
+            parts += (_head(name, "gauge", text), *(lines[name] for lines in machines if name in lines))
+        for name, counter in COUNTERS.items():
+            parts.append(_head(name, "counter", f"Counter {counter} of the daemon since its start."))
+            parts += (lines[name] for lines in machines if name in lines)
+        refused = {each.value: self._knowledge.refused[each] for each in RefusedFor}
+        parts += _counts("otolith_site_documents_refused_total", "Documents that were refused.", "reason", refused)
+        text = "Documents that came faster than they could be read."
+        parts += _counts("otolith_site_documents_dropped_total", text, "reason", {"queue": 0} | dict(dropped))
+        parts += _outlets(tuple(outlets))
+        return "".join(parts).encode(errors="replace")
+
+    def _lines(self, machine: KnownMachine, now: float) -> Lines:
+        basis, key = (machine.revision, machine.is_silent(now)), (machine.site, machine.name)
+        before = self._written.get(key)
+        if before is None or before[0] != basis:
+            if len(self._written) >= 2 * MAX_MACHINES:  # machines are forgotten, too
+                self._written.clear()
+            before = self._written[key] = basis, _written(machine, now)
+        return before[1]
 
 
-class _Source:
-    """What prometheus_client asks for metrics."""
+def _written(machine: KnownMachine, now: float) -> Lines:
+    """Return the lines of a machine."""
+    own, site = f'machine="{_escaped(machine.name)}"', f'site="{_escaped(machine.site)}"'
+    report, state, is_silent = machine.report, machine.state(now), machine.is_silent(now)
+    labels, rows = f"{{{own},{site}}}", dict[str, list[str]]()
 
-    def __init__(
-        self, knowledge: Knowledge, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float
-    ) -> None:
-        self._knowledge, self._dropped, self._outlets, self._now = knowledge, dropped, tuple(outlets), now
+    def add(name: str, value: float | None, where: str = labels) -> None:
+        if value is not None:
+            rows.setdefault(name, []).append(f"{name}{where} {_number(value)}\n")
 
-    def describe(self) -> Iterable[Metric]:
-        """Return nothing: the names are not checked against other collectors."""
-        return ()
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the metrics."""
-        machines = list(self._knowledge)
-        speaking = [(machine, machine.report) for machine in machines
-                    if machine.report is not None and not machine.is_silent(self._now)]  # fmt: skip
-        yield self._states(machines)
-        yield _gauge("otolith_machine_up", "Whether reports of the machine come.", (
-            (_own(machine), float(not machine.is_silent(self._now))) for machine in machines))  # fmt: skip
-        yield _gauge("otolith_report_timestamp_seconds", "End of the window of the latest report, Unix time.", (
-            (_own(machine), machine.report.window.end) for machine in machines if machine.report))  # fmt: skip
-        yield _gauge("otolith_events_open", "Events that are not cleared.", (
-            (_own(machine), float(len(report.open_events))) for machine, report in speaking))  # fmt: skip
-        yield _gauge("otolith_report_latency_seconds", "From the end of a window to its report.", (
-            (_own(machine), latency) for machine, report in speaking
-            if (latency := report.cost.latency_s) is not None))  # fmt: skip
-        yield _gauge("otolith_source_up", "Whether the connection to the machine is up.", (
-            (_own(machine), float(report.driver.up)) for machine, report in speaking if report.driver))  # fmt: skip
-        yield from _parameters(speaking)
-        yield from _counters(speaking)
-        for name, help_text, counts in (
-            ("refused", "Documents that were refused.", dict.fromkeys(RefusedFor, 0) | self._knowledge.refused),
-            ("dropped", "Documents that came faster than they could be read.", {"queue": 0} | dict(self._dropped)),
-        ):
-            metric = CounterMetricFamily(f"otolith_site_documents_{name}", help_text, labels=("reason",))
-            for reason, count in sorted(Counter(counts).items()):
-                metric.add_metric((str(reason),), float(count))
-            yield metric
-        yield from _outlets(self._outlets)
-
-    def _states(self, machines: Iterable[KnownMachine]) -> Metric:
-        metric = GaugeMetricFamily(
-            "otolith_machine_state",
-            "1 for the state that a machine is in, 0 for the others.",
-            labels=(*MACHINE, "state"),
-        )
-        for machine in machines:
-            state = machine.state(self._now)
-            for level in LEVELS:
-                if level is not Level.HINT:
-                    metric.add_metric((*_own(machine), level.name.lower()), float(level is state))
-        return metric
+    for level, word in STATES:
+        add("otolith_machine_state", level is state, f'{{{own},{site},state="{word}"}}')
+    add("otolith_machine_up", not is_silent)
+    add("otolith_report_timestamp_seconds", report.window.end if report else None)
+    if report is not None and not is_silent:
+        add("otolith_events_open", len(report.open_events))
+        add("otolith_report_latency_seconds", report.cost.latency_s)
+        add("otolith_source_up", report.driver.up if report.driver else None)
+        for parameter, row in islice(report.parameters.items(), MAX_PARAMETERS):
+            where = f'{{{own},parameter="{_escaped(parameter)}",{site},unit="{_escaped(row.unit)}"}}'
+            for value in VALUES:
+                add(f"otolith_parameter_{value}", getattr(row, value), where)
+        for name, counter in COUNTERS.items() if report.counters else ():
+            add(name, getattr(report.counters, counter))
+    return {name: "".join(lines) for name, lines in rows.items()}
 
 
-def _outlets(outlets: Iterable[OutletStatus]) -> Iterator[Metric]:
-    up = GaugeMetricFamily("otolith_outlet_up", "Whether the last try of an outlet succeeded.", labels=("outlet",))
-    rows = {name: CounterMetricFamily(f"otolith_outlet_{name}", text, labels=("outlet",)) for name, text in (
-        ("failures", "Tries of an outlet that failed."), ("sent", "Notices of events that an outlet passed on."),
-        ("lost", "Notices that were dropped: above the limit per hour, after a failure, or refused."))}  # fmt: skip
+def _outlets(outlets: tuple[OutletStatus, ...]) -> Iterator[str]:
+    yield _head("otolith_outlet_up", "gauge", "Whether the last try of an outlet succeeded.")
     for outlet in outlets:
         if outlet.is_tried:
-            up.add_metric((outlet.name,), float(outlet.is_up))
-        for name, metric in rows.items():
-            metric.add_metric((outlet.name,), float(getattr(outlet, name)))
-    yield from (up, *rows.values())
+            yield f'otolith_outlet_up{{outlet="{_escaped(outlet.name)}"}} {_number(outlet.is_up)}\n'
+    for name, text in OUTLETS.items():
+        values = {outlet.name: getattr(outlet, name) for outlet in outlets}
+        yield from _counts(f"otolith_outlet_{name}_total", text, "outlet", values)
 
 
-def _own(machine: KnownMachine) -> tuple[str, str]:
-    return machine.site, machine.name
+def _counts(name: str, text: str, label: str, values: Mapping[str, int]) -> Iterator[str]:
+    yield _head(name, "counter", text)
+    for key, value in sorted(values.items()):
+        yield f'{name}{{{label}="{_escaped(key)}"}} {_number(value)}\n'
 
 
-def _gauge(name: str, help_text: str, rows: Iterable[tuple[tuple[str, ...], float]]) -> Metric:
-    metric = GaugeMetricFamily(name, help_text, labels=MACHINE)
-    for labels, value in rows:
-        metric.add_metric(labels, value)
-    return metric
+def _head(name: str, kind: str, text: str) -> str:
+    return f"# HELP {name} {text}\n# TYPE {name} {kind}\n"
 
 
-def _parameters(speaking: Iterable[tuple[KnownMachine, ReportDocument]]) -> Iterator[Metric]:
-    rows = [((*_own(machine), name, row.unit), row)
-            for machine, report in speaking
-            for name, row in islice(report.parameters.items(), MAX_PARAMETERS)]  # fmt: skip
-    for key, help_text in VALUES.items():
-        metric = GaugeMetricFamily(f"otolith_parameter_{key}", help_text, labels=PARAMETER)
-        for labels, row in rows:
-            if (value := getattr(row, key)) is not None:
-                metric.add_metric(labels, value)
-        yield metric
+def _escaped(text: str) -> str:
+    """Return the value of a label."""
+    return str(text).translate(ESCAPES)
 
 
-def _counters(speaking: Iterable[tuple[KnownMachine, ReportDocument]]) -> Iterator[Metric]:
-    rows = [(_own(machine), report.counters) for machine, report in speaking if report.counters is not None]
-    for name in CountersDocument.model_fields:
-        metric = CounterMetricFamily(
-            f"otolith_daemon_{name}", f"Counter {name} of the daemon since its start.", labels=MACHINE
-        )
-        for labels, counters in rows:
-            metric.add_metric(labels, float(getattr(counters, name)))
-        yield metric
+def _number(value: float) -> str:
+    if math.isfinite(value):
+        return repr(float(value))
+    return "NaN" if math.isnan(value) else "+Inf" if value > 0.0 else "-Inf"

@@ -1,12 +1,14 @@
-"""Runs the site: uvicorn on one address, with bounds on connections."""
+"""Runs the site: uvicorn on one address, with bounds on connections, and on what waits for those who read slowly."""
 
 import asyncio
 import signal
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import uvicorn
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from otolith.publishing.zenoh_config import raise_descriptor_limit
@@ -19,37 +21,69 @@ from otolith_drivers.errors import ServiceError
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MAX_CONNECTIONS = 2000
-FIRST_REQUEST = 10.0  # s that a connection may take until its first request is whole
-KEEP_ALIVE = 10  # s that a connection may wait for its next request
+PATIENCE = 10.0  # s for a whole request, or for a reader to take something
+SWEEP = 10  # ticks of uvicorn, of 0.1 s, between two looks at all connections
+MAX_UNREAD = 16 << 10  # bytes that wait for a reader before it is sent no more
+MAX_ALL_UNREAD = 16 << 20  # bytes that wait for all readers together
+SEND_BUFFER = 128 << 10  # bytes of a connection that the kernel keeps
 BACKLOG = 512  # connections that wait to be accepted
+ACCEPTED = 16  # connections that are accepted in one step of the loop
 CLOSING = 3  # s for requests that have begun when the site ends
+SWITCH = 0.001  # s that a thread may keep the others waiting
 
 
 class _Patient(H11Protocol):
-    """Closes a connection that sends no request in time."""
-
-    _overdue: asyncio.TimerHandle
+    """A connection that is cut once it waits for a request, or for its reader, for too long."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         super().connection_made(transport)
-        self._overdue = self.loop.call_later(FIRST_REQUEST, self._close_unless_asked)
+        transport.set_write_buffer_limits(high=MAX_UNREAD)
+        self._phase: tuple[object, bool] = (None, True)  # Its request, and whether it waits for the next one
+        self._since = self.loop.time()  # When it last came on
+        if len(self.connections) > MAX_CONNECTIONS:
+            self._make_room()
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._overdue.cancel()
-        super().connection_lost(exc)
+    def resume_writing(self) -> None:
+        """Its reader has taken most of what waited."""
+        self._since = self.loop.time()
+        super().resume_writing()
 
-    def _close_unless_asked(self) -> None:
-        if self.cycle is None and not self.transport.is_closing():
-            self.transport.close()
+    @property
+    def unread(self) -> int:
+        """Bytes that wait for the reader."""
+        return self.transport.get_write_buffer_size()
+
+    @property
+    def waits(self) -> bool:
+        """Whether a request is to come."""
+        return self.cycle is None or self.cycle.response_complete
+
+    def idle(self, now: float) -> float:
+        """Return for how long neither the other side nor this one came on, s."""
+        phase = self.cycle, self.waits
+        if phase != self._phase or not (phase[1] or self.unread):
+            self._phase, self._since = phase, now
+        return now - self._since
+
+    def cut(self) -> None:
+        """End it, with all that waits; a connection that is only closed waits for its reader."""
+        self.transport.abort()
+
+    def _make_room(self) -> None:
+        """Cut who has been waiting for a request for the longest time."""
+        others = [each for each in self.connections if isinstance(each, _Patient) and each.waits and each is not self]
+        if others:
+            min(others, key=lambda each: each._since).cut()
 
 
-class _Server(uvicorn.Server):
-    """Ends by a signal without raising it again, so that everything is closed."""
+class Server(uvicorn.Server):
+    """Ends by a signal without raising it again, so that everything is closed; cuts who hinders others."""
 
     ended_by = 0
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
+        """Take the signals that end it, for as long as it serves."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._end, number)
@@ -57,6 +91,55 @@ class _Server(uvicorn.Server):
 
     def _end(self, number: int) -> None:
         self.should_exit, self.ended_by = True, number
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen."""
+        await super().startup(sockets)
+        for each in sockets or ():
+            each.listen(BACKLOG)  # asyncio has set it to ACCEPTED, which it accepts in one step
+
+    async def on_tick(self, counter: int) -> bool:
+        """Look at the connections once a second; return whether it is to end."""
+        if counter % SWEEP == 0:
+            self.sweep(asyncio.get_running_loop().time())
+        return await super().on_tick(counter)
+
+    def sweep(self, now: float) -> None:
+        """Cut connections that did not come on in time, and of slow readers so many that the others have memory."""
+        known = [each for each in self.server_state.connections if isinstance(each, _Patient)]
+        ages = {each: each.idle(now) for each in known}
+        slow = sorted((each for each in known if each.unread), key=lambda each: -ages[each])
+        excess = sum(each.unread for each in slow) - MAX_ALL_UNREAD
+        for each in slow:
+            if excess > 0:
+                excess -= each.unread
+                each.cut()
+        for each in known:
+            if ages[each] > PATIENCE:
+                each.cut()
+
+
+def server_of(app: ASGIApp) -> Server:
+    """Return what serves an application."""
+    return Server(uvicorn.Config(
+        app, http=_Patient, ws="none", lifespan="off", log_config=None, access_log=False, server_header=False,
+        date_header=True, limit_concurrency=MAX_CONNECTIONS + ACCEPTED, backlog=ACCEPTED,
+        timeout_keep_alive=round(PATIENCE), timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
+    ))  # fmt: skip
+
+
+def listening_on(address: tuple[str, int]) -> socket.socket:
+    """Return a socket that listens; raise OSError if it cannot."""
+    listening = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)  # connections inherit it
+        listening.bind(address)
+        listening.listen(BACKLOG)
+    except OSError:
+        listening.close()
+        raise
+    return listening
 
 
 def run_site(
@@ -68,24 +151,15 @@ def run_site(
         ServiceError: the address cannot be listened on.
     """
     raise_descriptor_limit()
-    host, port = settings.http.address
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    sys.setswitchinterval(SWITCH)
     pages = SitePages(collector, settings, [outlet.status for outlet in outlets])
-    config = uvicorn.Config(
-        pages.app(), http=_Patient, ws="none", lifespan="off", log_config=None,
-        access_log=False, server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS, backlog=BACKLOG,
-        timeout_keep_alive=KEEP_ALIVE, timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
-    )  # fmt: skip
-    with socket.socket(family, socket.SOCK_STREAM) as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind((host, port))
-            listening.listen(BACKLOG)
-        except OSError as error:
-            remedy = "set http.listen to another address"
-            raise ServiceError(f"http.listen = {settings.http.listen}: {error.strerror}; {remedy}") from error
-        server = _Server(config)
-        with collector, running(outlets):
-            ready(f"http://{settings.http.listen}/")
-            asyncio.run(server.serve([listening]))
+    server = server_of(pages.app())
+    try:
+        listening = listening_on(settings.http.address)
+    except OSError as error:
+        remedy = "set http.listen to another address"
+        raise ServiceError(f"http.listen = {settings.http.listen}: {error.strerror}; {remedy}") from error
+    with listening, collector, running(outlets):
+        ready(f"http://{settings.http.listen}/")
+        asyncio.run(server.serve([listening]))
     return server.ended_by

@@ -12,7 +12,7 @@ import pytest
 from otolith.health.schema import Language
 from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
-from otolith.site.metrics import exposition
+from otolith.site.metrics import Metrics
 from otolith.site.outlets import runner
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.mail import Mail
@@ -112,7 +112,7 @@ def test_a_machine_that_is_gone_while_the_outlet_fails_is_told_to_be_gone() -> N
 def test_what_was_refused_is_lost_and_an_outlet_that_was_not_tried_is_neither_up_nor_down() -> None:
     outlet, works = Scripted(), Works(Knowledge())
     own = running(outlet, works)
-    assert "otolith_outlet_up{" not in exposition(works.knowledge, {}, [own.status], START).decode()
+    assert "otolith_outlet_up{" not in Metrics(works.knowledge).exposition({}, [own.status], START).decode()
     own.start()
     outlet.error = OutletError("away", 0)
     wait_for(lambda: own.status.failures == 1)

@@ -1,0 +1,85 @@
+"""Pages of the past of machines: each is made once for all who ask, few at a time, and one of each daemon."""
+
+import asyncio
+import time
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from otolith.health.schema import Language, ReportDocument
+from otolith.publishing.received_history import received_page
+from otolith.site.collector import Collector
+from otolith.site.past import SPANS, Past, PastQuery, past_of
+
+# Thresholds: docs/reference/thresholds-site.md has the origin of each.
+MAX_LOOKING = 4  # pages that are made at a time
+MAX_WAITING = 12  # pages that wait to be made
+PAST_AGE = 10.0  # s for which a page is given to others who ask for it
+MAX_KEPT = 16  # pages that are kept for so long
+
+
+Key = tuple[str, str, str, Language]
+"""Site, machine, span, and the language of the page."""
+
+
+@dataclass(frozen=True, slots=True)
+class PastPage:
+    """A report page, before and from its header."""
+
+    head: bytes
+    rest: bytes
+    past: Past
+
+
+class PastPages:
+    """Asks daemons in threads of its own."""
+
+    def __init__(self, collector: Collector, zone: str | None) -> None:
+        """Times are shown in a zone, by default in that of the machine."""
+        self._collector, self._zone = collector, zone
+        self._asking = ThreadPoolExecutor(MAX_LOOKING, "ask-past")
+        self._making = ThreadPoolExecutor(1, "make-past")  # one core is enough for those who look at the past
+        self._looking = asyncio.Semaphore(MAX_LOOKING)
+        self._daemons: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)  # By where it is asked
+        self._pages: dict[Key, asyncio.Task[PastPage]] = {}
+        self._open = 0  # pages that are being made, or wait for it
+
+    async def get(self, key: Key, latest: ReportDocument | None) -> PastPage | None:
+        """Return a page; None if too many wait for theirs.
+
+        Raises:
+            ValueError, LookupError, ArithmeticError, OSError: it cannot be shown; anybody may have published it.
+        """
+        if key not in self._pages:
+            if self._open >= MAX_LOOKING + MAX_WAITING:
+                return None
+            self._open += 1
+            self._pages[key] = asyncio.create_task(self._page(key, latest))
+        return await asyncio.shield(self._pages[key])  # who leaves does not end it for the others
+
+    async def _page(self, key: Key, latest: ReportDocument | None) -> PastPage:
+        loop, lock = asyncio.get_running_loop(), self._daemons[self._collector.where(*key[:2])]
+        try:
+            await lock.acquire()
+            begun = loop.time()
+            try:
+                async with self._looking:
+                    begun = loop.time()
+                    return await self._made(key, latest)
+            finally:
+                loop.call_later(loop.time() - begun, lock.release)  # half of the time no page asks this daemon
+        finally:
+            self._open -= 1
+            loop.call_later(PAST_AGE, self._pages.pop, key, None)
+            for old in [key for key, task in self._pages.items() if task.done()][:-MAX_KEPT]:
+                del self._pages[old]
+
+    async def _made(self, key: Key, latest: ReportDocument | None) -> PastPage:
+        loop, now, window = asyncio.get_running_loop(), time.time(), 0.0
+        if latest is not None:
+            window = latest.window.end - latest.window.start
+        query = PastQuery(*key[:2], now - SPANS[key[2]], now, window)
+        past = await loop.run_in_executor(self._asking, past_of, self._collector.ask, query, latest, (key[3], self._zone))
+        page = await loop.run_in_executor(self._making, received_page, past.history, query.since, now)
+        head, sign, rest = page.partition("<header>")
+        return PastPage(head.encode(errors="replace"), f"{sign}{rest}".encode(errors="replace"), past)
