@@ -29,7 +29,7 @@ SOURCES = {
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
     "runtime": [DAEMON / "runtime", DAEMON / "runtime" / "hall", DAEMON / "publishing", DAEMON],
-    "site": [DAEMON / "site", DAEMON / "site" / "outlets"],
+    "site": [DAEMON / "site", *(DAEMON / "site").glob("*/")],
     "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin", DAEMON / "fmu", DAEMON],

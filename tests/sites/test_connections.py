@@ -83,10 +83,14 @@ def test_who_neither_sends_nor_takes_anything_is_cut(sent: bytes) -> None:
 def test_who_sends_piece_by_piece_what_never_becomes_whole_is_cut(sent: bytes) -> None:
     async def test(server: Server, opened: Open) -> None:
         loop, client = asyncio.get_running_loop(), await opened(sent)
-        with pytest.raises(OSError, match=r"(?i)reset|pipe"):
+
+        async def send_for_ever() -> None:
             while True:
                 await loop.sock_sendall(client, b"a")
                 await asyncio.sleep(0.05)
+
+        with pytest.raises(OSError, match=r"(?i)reset|pipe"):
+            await send_for_ever()
 
     with_server(SMALL, test)
 
@@ -123,7 +127,7 @@ def test_a_new_connection_has_the_place_of_the_one_that_waits_for_longest(monkey
     monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 20)
 
     async def test(_: Server, opened: Open) -> None:
-        for _ in range(60):
+        for _index in range(60):
             await opened()
         answer = await asyncio.get_running_loop().sock_recv(await opened(REQUEST), 100)
         assert answer.split()[1] == b"200"
