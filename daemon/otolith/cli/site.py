@@ -10,7 +10,7 @@ import click
 from otolith.cli.common import FILE, INTERRUPTED, log_to_stderr
 from otolith.cli.terminal import echo
 
-EXTRA = ("prometheus_client", "starlette", "uvicorn")
+EXTRA = ("starlette", "uvicorn")
 
 
 @click.command()
