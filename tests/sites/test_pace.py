@@ -114,14 +114,14 @@ def asked(monkeypatch: pytest.MonkeyPatch, free: threading.Event) -> tuple[PastP
     """Pages of which each is made once ``free`` is set, and those that are being made."""
     queries = list[PastQuery]()
 
-    def past(ask: Any, query: PastQuery, latest: Any) -> Any:
+    def past(ask: Any, query: PastQuery, *rest: Any) -> Any:
         queries.append(query)
         free.wait()
-        return past_of(ask, query, latest)
+        return past_of(ask, query, *rest)
 
     monkeypatch.setattr(past_pages, "past_of", past)
     monkeypatch.setattr(past_pages, "received_page", lambda *_: "<header>")
-    return PastPages(cast("Collector", Works())), queries
+    return PastPages(cast("Collector", Works()), None), queries
 
 
 def test_a_page_of_the_past_is_made_once_for_all_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,8 +130,8 @@ def test_a_page_of_the_past_is_made_once_for_all_who_ask(monkeypatch: pytest.Mon
     pages, queries = asked(monkeypatch, free)
 
     async def run() -> None:
-        first = await asyncio.gather(*(pages.get(SITE, MACHINE, "1h", None) for _ in range(200)))
-        again = await pages.get(SITE, MACHINE, "1h", None)
+        first = await asyncio.gather(*(pages.get((SITE, MACHINE, "1h", "en"), None) for _ in range(200)))
+        again = await pages.get((SITE, MACHINE, "1h", "en"), None)
         assert {id(page) for page in first} == {id(again)}
 
     asyncio.run(run())
@@ -143,7 +143,7 @@ def test_more_pages_of_the_past_than_are_made_are_refused(monkeypatch: pytest.Mo
     pages, queries = asked(monkeypatch, free)
 
     async def run() -> None:
-        waiting = [asyncio.create_task(pages.get(SITE, f"m-{index}", "1h", None)) for index in range(100)]
+        waiting = [asyncio.create_task(pages.get((SITE, f"m-{index}", "1h", "en"), None)) for index in range(100)]
         await asyncio.sleep(0.2)
         assert len(queries) == MAX_LOOKING
         free.set()
@@ -159,7 +159,7 @@ def test_a_daemon_is_asked_for_one_page_at_a_time(monkeypatch: pytest.MonkeyPatc
     pages, queries = asked(monkeypatch, free)
 
     async def run() -> None:
-        waiting = [asyncio.create_task(pages.get(SITE, f"m-{index}", "1h", None)) for index in range(3)]
+        waiting = [asyncio.create_task(pages.get((SITE, f"m-{index}", "1h", "en"), None)) for index in range(3)]
         await asyncio.sleep(0.2)
         assert len(queries) == 1
         free.set()

@@ -79,7 +79,9 @@ class PastPages:
         if latest is not None:
             window = latest.window.end - latest.window.start
         query = PastQuery(*key[:2], now - SPANS[key[2]], now, window)
-        past = await loop.run_in_executor(self._asking, past_of, self._collector.ask, query, latest, (key[3], self._zone))
+        past = await loop.run_in_executor(
+            self._asking, past_of, self._collector.ask, query, latest, (key[3], self._zone)
+        )
         page = await loop.run_in_executor(self._making, received_page, past.history, query.since, now)
         head, sign, rest = page.partition("<header>")
         return PastPage(head.encode(errors="replace"), f"{sign}{rest}".encode(errors="replace"), past)
