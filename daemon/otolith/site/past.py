@@ -39,7 +39,7 @@ class PastQuery:
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class PastAnswers:
     """What daemons answered, and how many of the queries they did not answer."""
 
     history: ReceivedHistory
@@ -79,7 +79,7 @@ def past_of(
     query: PastQuery,
     latest: ReportDocument | None,
     reader: tuple[Language | None, str | None] = (None, None),
-) -> Past:
+) -> PastAnswers:
     """Return the history of a machine in the language and zone of its ``reader``, by default in those of the machine.
 
     The events and the last reports are asked for first.
@@ -97,7 +97,7 @@ def past_of(
         reports[latest.window.end] = latest
     ordered = [reports[end] for end in sorted(reports)]
     history = ReceivedHistory(query.site, query.machine, ordered, events, reader)
-    return Past(history, len(pieces) + 1, asking.missing)
+    return PastAnswers(history, len(pieces) + 1, asking.missing)
 
 
 def _pieces(query: PastQuery) -> Iterator[tuple[float, float]]:

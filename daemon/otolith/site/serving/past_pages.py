@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from otolith.health.schema import Language, ReportDocument
 from otolith.publishing.received_history import received_page
 from otolith.site.collector import Collector
-from otolith.site.past import SPANS, Past, PastQuery, past_of
+from otolith.site.past import SPANS, PastAnswers, PastQuery, past_of
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MAX_LOOKING = 4  # pages that are made at a time
@@ -28,7 +28,7 @@ class PastPage:
 
     head: bytes
     rest: bytes
-    past: Past
+    past: PastAnswers
 
 
 class PastPages:
