@@ -93,8 +93,8 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
             "ein Sensor misst falsch: V zeigt um -0.3% falsch an: Sensor und Skalierung prüfen (>99 %); oder K (1 %)",
         ),
         (
-            "i is frozen at 3 A for 2 s (20 samples) from t = 4 s while the twin moves on",
-            "i steht seit t = 4 s für 2 s (20 Messwerte) auf 3 A fest, während der Zwilling sich bewegt",
+            "i is frozen at 3 A for 2 s (20 samples) from t = 4 s although the twin predicts changes",
+            "i steht seit t = 4 s für 2 s (20 Messwerte) auf 3 A fest, obwohl der Zwilling Änderungen vorhersagt",
         ),
         (
             "i is clipped at 3 A from t = 4 s: 20 of 100 records do not count; look at the range of the sensor",

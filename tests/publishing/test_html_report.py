@@ -275,6 +275,18 @@ def test_a_simulated_machine_is_described_in_words(simulated: dict[str, str], si
         assert text in shown.text
 
 
+def test_a_curve_has_a_unit_and_the_digits_of_its_value(simulated: dict[str, str]) -> None:
+    page = simulated["unbalance"]
+    cards = [card for card in page.split('<section class="card">') if 'class="l-value"' in card]
+    assert cards
+    for card in cards:
+        title, value = (" ".join(re.sub(r"<[^>]*>", " ", card.partition(begin)[2].partition(end)[0]).split())
+                        for begin, end in (("<h3>", "</h3>"), ('<span class="now">', "</div>")))  # fmt: skip
+        number, unit = re.match(r"(\S+) ± \S+ (\S+)", value).groups()  # type: ignore[union-attr]
+        assert title.endswith(f" in {unit}")
+        assert re.search(rf'class="l-value"[^>]*>{re.escape(number)}<', card)
+
+
 def test_a_far_limit_is_only_in_words(simulated: dict[str, str]) -> None:
     shown = Page(simulated["degrading"])
     assert "WATCH above 9.425" in shown.text

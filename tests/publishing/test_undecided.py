@@ -87,6 +87,19 @@ def test_what_is_known_and_grave_comes_before_what_is_open(language: Language, t
         assert say("undecided_advice") not in text, name
 
 
+def test_the_specialist_reads_no_cause_twice() -> None:
+    base, formulas = undecided("en"), "a sensor is wrong: omega 0.25·sin(1·θ) rad/s (13%); or K (9%)"
+    finding = base.findings[0].model_copy(update={"text": formulas})
+    reason = f"this window differs from the prediction; {formulas}; not explained"
+    parameters = {name: row.model_copy(update={"reason": reason}) for name, row in base.parameters.items()}
+    table, console = LiveTable(lambda: "", details=True), Terminal(file=io.StringIO(), width=200)
+    table.add(base.model_copy(update={"findings": (finding,), "parameters": parameters}).to_json())
+    console.print(table)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert text.count("sin(") == 1
+    assert "this window differs from the prediction; not explained" in text
+
+
 @pytest.mark.parametrize("details", [False, True])
 def test_causes_that_are_equally_likely_have_formulas_for_the_specialist_only(details: bool) -> None:
     """A class that is no event yet is open to people, as is a test that goes on."""
@@ -102,5 +115,5 @@ def test_causes_that_are_equally_likely_have_formulas_for_the_specialist_only(de
     table.add(document.to_json())
     console.print(table)
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "(2 candidates)" in text
+    assert "(2 possible causes)" in text
     assert ("sin(" in text) is details

@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.cli.console import Terminal
+from otolith.cli.main import cli
 from otolith.cli.operation.live_table import LiveTable
 from otolith.health.schema import LANGUAGES, Language, ReportDocument, Status
 from otolith.health.text import performance_texts, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
 from otolith.publishing.html_report import html_report
 from otolith.simulation.performance import Estimates, ReferenceValues, figures_of
-from otolith.storage.history import PERFORMANCE, WINDOW, history_path
+from otolith.storage.history import PERFORMANCE, WINDOW, describe_machine, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError
@@ -189,13 +191,15 @@ def test_history_page_and_live_table_have_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: MotorScenario, windows: Cut, language: Language
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    *_, last = report_of(load_machine(CONFIG / "dc-motor.toml"), scenario, windows)
+    machine = load_machine(CONFIG / "dc-motor.toml")
+    *_, last = report_of(machine, scenario, windows)
     figures = last.performance
     assert figures is not None
     assert last.health is not None
     last = last.model_copy(update={"health": last.health.model_copy(update={"language": language})})
     writer = HistoryWriter(history_path("here", "motor"), Bounds(20_000_000, 3650, 24))
     numbers, _ = writer.open(last.window.start)
+    writer.description = describe_machine(machine.twin, machine.plan)
     writer.add(numbers.number(last))
     writer._write_waiting()
     writer._close()
@@ -214,6 +218,12 @@ def test_history_page_and_live_table_have_them(
         assert texts.translated(figure.meaning) in shown
         assert len(performance_texts(figure, texts)) == 3
     assert name not in page
+    assert "V_a = 24 V" in page  # the operating point has units
+    asked = ["history", "motor", "--since", "1970-01-01", "--every", "window"]
+    printed = CliRunner().invoke(cli, asked, env={"COLUMNS": "120"})
+    assert PERFORMANCE not in printed.output
+    change = {row: "%" in line for row in figures for line in printed.output.splitlines() if row in line}
+    assert change == {row: figure.over == "point" for row, figure in figures.items()}
 
 
 def test_a_fault_of_a_machine_file_is_named(tmp_path: Path) -> None:

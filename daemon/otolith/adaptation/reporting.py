@@ -68,9 +68,9 @@ from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = (
-    "the estimates of windows differ {:.1f} times more than their intervals allow: the twin or [noise] is off"
+    "the estimates of windows differ {:.1f} times more than their intervals allow: the twin or [noise] is wrong"
 )
-UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
+UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is wrong"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 UNDECIDED_WINDOWS = 4  # in a row, from which on the stated levels may be the cause
 LEVELS_TOO_SMALL = (
@@ -580,7 +580,7 @@ def _corrected_value(test: SequentialTest) -> str:
     if test.best.type is not FaultType.PARAMETER:
         return ""
     names = ", ".join(parameter.name for parameter in test.best.problem.free if parameter.name in known)
-    return names and f"if nothing has happened to the machine, {names} in its file is off: correct it or estimate it"
+    return names and f"if nothing has happened to the machine, {names} in its file is wrong: correct it or estimate it"
 
 
 def _experiment(test: SequentialTest | None, situation: Situation | None) -> str:

@@ -138,7 +138,7 @@ class UnbalanceComparison:
         injected = equation_text(f"injected {self.amplitude:.4g}·sin({self.inner:.4g}·{self.source} + ...) N*m")
         if self.component is None:
             return f"{injected}; no component was found"
-        return f"{injected}; found {equation_text(self.component.equation)} ({self.component.conditions})"
+        return f"{injected}; found {equation_text(self.component.equation)}"
 
 
 def compare_unbalance(fault: Unbalance, inertia: float, components: Sequence[ComponentDocument]) -> UnbalanceComparison:
@@ -306,7 +306,7 @@ class Demo:
         self._console.print(self._table(rows))
         self._print_changes(rows)
         if not rows:
-            self._print("no good window with excitation: nothing was compared", "red")
+            self._print("no window determines a parameter: nothing was compared", "red")
         elif wrong:
             self._print(f"{wrong} estimates are wrong by more than {TOLERANCE:.1%}", "red")
         else:
@@ -369,8 +369,8 @@ class Demo:
 
     def _table(self, rows: list[Comparison]) -> Table:
         step = max(1, len(rows) // MAX_ROWS)
-        every = "" if step == 1 else f" (one row of {step})"
-        table = Table(title=f"injected and estimated, good windows with excitation{every}")
+        every = "" if step == 1 else f", one of {step}"
+        table = Table(title=f"injected and estimated: windows that determine the parameters{every}")
         for column in ("window", "parameter", "injected", "estimated ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
         units = {parameter.name: parameter.unit for parameter in self._machine.problem.free}

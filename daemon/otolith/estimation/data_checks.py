@@ -510,7 +510,8 @@ def _frozen_sentence(channel: _Channel, run: _FrozenRun) -> str:
     when = f"for {length} ({count} samples) from {time_text(window.start + window.ahead + float(times[0]))}"
     if count == len(channel.present):  # it may be so for longer: the finding has the time of the first window
         when = f"throughout the window of {length} ({count} samples)"
-    return f"{channel.name} is {kind} at {value:.6g} {unit_text(channel.output.unit)} {when} while the twin moves on"
+    shown = f"{value:.6g} {unit_text(channel.output.unit)}"
+    return f"{channel.name} is {kind} at {shown} {when} although the twin predicts changes"
 
 
 def drop_repeats(window: Window, twin: Definition, checked: frozenset[str] | None = None) -> tuple[Window, list[str]]:

@@ -123,6 +123,7 @@ class Curve:
     last: HistorySample | None
     away: Mapping[str, float]  # Percent of the windows with another status than estimated
     scale: Scale  # In which its present value and all beside it are written
+    present: str = ""  # The number of its present value, rounded to its interval
     plot: Mapping[str, Sequence[Any]] | None = None
     """``band``: polygons of the 95 % interval; ``lines``: whether the value was estimated then, and points; ``marks``;
     ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""
@@ -210,7 +211,8 @@ def html_report(reader: PageSource, samples: Iterable[HistorySample], interval: 
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
         zone=zone, lanes=list(_lanes(axis, latest, states)), curves=curves, is_over=is_over,
         gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,
-        conditions=_conditions(reader, told, say), hints=[event for event, worst, _ in told if worst is Level.HINT],
+        conditions=_conditions(reader, told, say), condition_of=_conditions_of(latest),
+        hints=[event for event, worst, _ in told if worst is Level.HINT],
         findings=reader.findings(since),
         undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
@@ -223,6 +225,13 @@ def _conditions(
     """Return what the conditions of events mean, by the rules of the machine."""
     rules = (*reader.own_rules(), *load_rules(texts.language))
     return pages_of(dict.fromkeys(event.condition_id for event, _, _ in told), rules, texts)
+
+
+def _conditions_of(latest: ReportDocument | None) -> dict[str, str]:
+    """Return the conditions of components by their ids, where an event says which one of their family it is."""
+    known = {event.id.rpartition("@")[0]: event.condition for event in (latest.events if latest else ())}
+    own = {row.id: known.get(f"component/{row.id.rpartition('/')[0]}") for row in (latest.components if latest else ())}
+    return {key: condition for key, condition in own.items() if condition}
 
 
 def _moment(seconds: float, zone: str | None, form: str) -> str:
@@ -331,7 +340,8 @@ def _curves(
         for row in same:
             counts[row.status] += row.count
         away = {name: 100.0 * count / counts.total() for name, count in counts.items() if name not in TRUSTED}
-        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away, _scale(parameter, same))
+        scale, last = _scale(parameter, same), same[-1] if same else None
+        curve = Curve(name, parameter, component, limits, last, away, scale, _present(scale, parameter, component))
         points = list(_thinned(axis, same))
         yield replace(curve, plot=_plot(axis, gaps, points, curve)) if points else curve
 
@@ -342,6 +352,14 @@ def _scale(parameter: ParameterDocument | None, samples: Sequence[HistorySample]
         size, sd = (parameter.nominal, 0.0) if parameter.value is None else (parameter.value, parameter.sd or 0.0)
         return scale_of(size, parameter.unit, QUANTILE * sd)
     return scale_of(samples[-1].last, samples[-1].unit) if samples else Scale(0, "")
+
+
+def _present(scale: Scale, parameter: ParameterDocument | None, component: ComponentDocument | None) -> str:
+    """Return the number of a present value, rounded to its interval; empty if there is none."""
+    item = component.values["amplitude"] if component else parameter
+    if item is None or item.value is None or item.sd is None:
+        return ""
+    return scale.numbers(item.value, QUANTILE * item.sd)[0]
 
 
 def _thinned(axis: Axis, samples: Iterable[HistorySample]) -> Iterator[HistorySample]:

@@ -135,7 +135,8 @@ def describe_machine(
     texts = {"title": twin.title, "equations": [*twin.equations, *sides]} | ({} if log is None else {"log": log})
     texts |= {} if file is None else {"file": str(file.absolute())}
     rules = [rule.model_dump(mode="json", exclude={"is_own"}) for rule in plan.rules if rule.is_own]
-    keys = {"values": values, "limits": limits, "sites": sites, "places": places, "rules": rules}
+    units = {row.name: row.unit for rows in (twin.states, twin.inputs, twin.outputs) for row in rows}
+    keys = {"values": values, "units": units, "limits": limits, "sites": sites, "places": places, "rules": rules}
     return json_text({**texts, **keys})
 
 
@@ -146,6 +147,7 @@ class _Description(BaseModel):
     file: str = ""
     equations: tuple[tuple[str, str], ...] = ()
     values: dict[str, tuple[float | None, str, str]] = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)  # Of states, inputs and outputs
     limits: dict[str, tuple[tuple[Level, float, bool], ...]] = Field(default_factory=dict)
     sites: dict[str, tuple[str, str, str]] = Field(default_factory=dict)
     rules: tuple[Rule, ...] = ()

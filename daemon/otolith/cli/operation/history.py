@@ -250,7 +250,8 @@ def _print_table(
     console.print(say("history_of", machine=reader.machine, site=reader.site, time=begin, values=values))
     if samples:
         titles = _titles({sample.name for sample in samples}, reader.description().get("places", {}), say)
-        console.print(Localised(_table(samples, titles, console.width, say), say.decimals))
+        varying = _of_operation(reader)
+        console.print(Localised(_table(samples, titles, varying, console.width, say), say.decimals))
     findings = reader.findings(since) if has_findings else []
     if details:
         print_changes(console, events, _bundles(reader, since), say)
@@ -278,8 +279,13 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
 
 
 def _titles(names: "Collection[str]", places: "Mapping[str, str]", texts: "Texts") -> dict[str, str]:
-    """Return the titles of rows: parameters by their names, components by place and family if no other has these."""
-    titles = {name: name for name in names}
+    """Return the titles of rows: parameters and figures by their names, components by place and family.
+
+    One that another row has too is the name in the history.
+    """
+    from otolith.storage.history import PERFORMANCE
+
+    titles = {name: name.removeprefix(PERFORMANCE) for name in names}
     for name in names:
         place, _, rest = name.partition("/")
         if rest and place in places:
@@ -288,10 +294,22 @@ def _titles(names: "Collection[str]", places: "Mapping[str, str]", texts: "Texts
     return {name: title if counts[title] == 1 else name for name, title in titles.items()}
 
 
+def _of_operation(reader: "HistoryReader") -> set[str]:
+    """Return the names of figures of performance that are means over a window: another load changes them, too."""
+    from otolith.storage.history import PERFORMANCE
+
+    figures = next((report.performance for report in reader.latest(1)), None) or {}
+    return {f"{PERFORMANCE}{name}" for name, figure in figures.items() if figure.over == "window"}
+
+
 def _table(
-    samples: "Sequence[HistorySample]", titles: "Mapping[str, str]", width: int, texts: "Texts"
-) -> "RenderableType":
-    """A row for each parameter: last value and interval, change and range of the means, and their curve."""
+    samples: "Sequence[HistorySample]", titles: "Mapping[str, str]", varying: "Collection[str]", width: int,
+    texts: "Texts",
+) -> "RenderableType":  # fmt: skip
+    """A row for each parameter: last value and interval, change and range of the means, and their curve.
+
+    Those that are ``varying`` with the operation have no change.
+    """
     from otolith.cli.operation.live_table import parameter_table, sparkline
     from otolith_drivers.units import scale_of
 
@@ -310,7 +328,7 @@ def _table(
         curve = sparkline(tuple(sum(values) / len(values) for _, values in sorted(bins.items())))
         end, begin = row[-1], row[0].mean
         reach = None if end.low is None or end.high is None else 0.5 * (end.high - end.low)
-        change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
+        change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin and name not in varying else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
         scale = scale_of(end.last, unit, reach)
         limits = (scale.number(low), scale.number(high)) if has_range else ()

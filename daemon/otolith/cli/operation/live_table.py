@@ -22,7 +22,15 @@ from otolith.cli.console import Localised, Terminal
 from otolith.cli.machines import last_reports
 from otolith.cli.terminal import echo
 from otolith.health.limits import Level
-from otolith.health.schema import DriverDocument, EventDocument, FindingKind, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import (
+    DriverDocument,
+    EventDocument,
+    FindingDocument,
+    FindingKind,
+    ParameterDocument,
+    ReportDocument,
+    Status,
+)
 from otolith.health.text import (
     PARTS,
     Texts,
@@ -328,7 +336,8 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         names: dict[str, list[str]] = {}
         for name, parameter in document.parameters.items():
             names.setdefault(getattr(parameter, key) or "", []).append(name)
-        shown = ((", ".join(own), in_local_time(text, zone)) for text, own in names.items() if text)
+        told = [(_without(text, candidates), own) for text, own in names.items()]
+        shown = ((", ".join(own), in_local_time(text, zone)) for text, own in told if text)
         lines += [Text(f"{own}: {text}", style=style) for own, text in shown]
     for finding in candidates:
         lines.append(Text(f"{texts('open_test')}: {in_local_time(finding.text, zone)}", style="magenta"))
@@ -339,6 +348,13 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         explained = texts("explained" if document.fit.explained else "unexplained")
         lines.append(Text(f"{texts('residual', errors=errors)}: {explained}"))
     return lines
+
+
+def _without(text: str, findings: Iterable[FindingDocument]) -> str:
+    """Return a reason without the findings that have lines of their own."""
+    for finding in findings:
+        text = text.replace(finding.text, "")
+    return PARTS.join(part for part in text.split(PARTS) if part)
 
 
 def _counters(document: ReportDocument, texts: Texts) -> list[Text]:
