@@ -196,7 +196,7 @@ def test_while_undecided_there_is_one_line_without_formulas() -> None:
     )
     document = report(3).model_copy(update={"findings": (finding,), "explanations": causes})
     text = undecided_text(document)
-    assert_says(text, "new torque on the shaft", "since t = 74 s", "not yet known", "3 candidates")
+    assert_says(text, "new torque on the shaft", "since t = 74 s", "not yet known", "3 possible causes")
     assert "sin(" not in text
     assert undecided_text(report(3)) == ""
     unexplained = document.model_copy(update={"explanations": ()})

@@ -259,6 +259,17 @@ def _event_sentence(event: EventDocument, when: Clock, *, details: bool) -> str:
     return f"{texts('event', **values, sure=sure, advice=advice)}{notes}"
 
 
+def event_lines(event: EventDocument) -> list[str]:
+    """An open event for the specialist, a line each: what since when, values, notes, what to do, what explains it."""
+    texts, when = texts_in(event.language), clock_in(event.timezone)
+    what = f"{texts.translated(event.state)}: {texts.part(event.part)}: {event.condition}"
+    sure = f" ({probability})" if (probability := probability_text(event)) else ""
+    advice = f"{texts('what_to_do')}: {event.advice}" if event.advice else ""
+    lines = [f"{what} {texts('since', time=when(event.since))}", f"{in_local_time(event.text, event.timezone)}{sure}"]
+    lines += [*note_texts(event, when), advice, event.formulas, event.setting, explain_command(event)]
+    return [texts.decimals(line) for line in lines if line]
+
+
 def explain_command(event: EventDocument) -> str:
     """Return the command that explains the conditions of an event without a network; empty if no rule has them."""
     return shlex.join(["otolith", "explain", *event.condition_id.split()]) if event.condition_id else ""

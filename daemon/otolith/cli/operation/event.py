@@ -82,7 +82,7 @@ def list_(machine: str, as_json: bool) -> None:
     Example:
       otolith event list press-3
     """
-    from otolith.health.text import event_text
+    from otolith.health.text import event_lines
 
     known = _known(machine)
     rows = [known.labels.of_event(item) for item in known.events.values() if item.end is None]
@@ -90,7 +90,7 @@ def list_(machine: str, as_json: bool) -> None:
         echo_json({"events": [item.model_dump(mode="json", exclude_none=True) for item in rows]})
         return
     for item in rows:
-        echo(_key(item), f"  {event_text(item, details=True)}")
+        echo(_key(item), *(f"  {line}" for line in event_lines(item)))
     for key in known.shelves.keys() - {_key(item) for item in rows}:
         until = local_time(known.labels.unix(known.shelves[key].note.until or 0.0), known.zone)
         echo(key, f"  no event is open; one that begins is shelved until {until}")

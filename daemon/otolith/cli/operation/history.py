@@ -266,7 +266,7 @@ def _print_table(
         if findings:
             console.print(say("findings_counted", count=len(findings)))
     if not samples and not events:
-        echo("no values or events since then", err=True)
+        echo("no values or events since then; a daemon writes values once a minute", err=True)
 
 
 def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
