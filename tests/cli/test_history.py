@@ -65,7 +65,7 @@ def test_the_table_has_values_events_and_findings(written: HistoryWriter, is_run
     text = run(MACHINE, "--details").stdout
     assert text.count("raised: WATCH: winding") == 4
     assert "finding: new torque on the shaft" in text
-    assert f"in {COUNT // 2} windows" in text
+    assert f"windows: {COUNT // 2}\n" in text
 
 
 def test_a_cleared_event_says_so_once(written: HistoryWriter) -> None:

@@ -297,9 +297,12 @@ def _titles(names: "Collection[str]", places: "Mapping[str, str]", texts: "Texts
 def _of_operation(reader: "HistoryReader") -> set[str]:
     """Return the names of figures of performance that are means over a window: another load changes them, too."""
     from otolith.storage.history import PERFORMANCE
+    from otolith_drivers.errors import ConfigurationError
 
-    figures = next((report.performance for report in reader.latest(1)), None) or {}
-    return {f"{PERFORMANCE}{name}" for name, figure in figures.items() if figure.over == "window"}
+    with suppress(ConfigurationError, ValueError):  # a report that the disk has damaged hinders no table
+        figures = next((report.performance for report in reader.latest(1)), None) or {}
+        return {f"{PERFORMANCE}{name}" for name, figure in figures.items() if figure.over == "window"}
+    return set()
 
 
 def _table(
