@@ -1,15 +1,17 @@
 """Pictures of the docs, for ``make screens``: reports and recordings of a motor, healthy and with three faults.
 
-Reports are shown by a headless Chromium, recordings by the Rerun viewer under Xvfb. On Debian: ``apt install chromium
-xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libx11-xcb1 libxcursor1 libxrandr2 libxi6``.
+Reports are shown by a headless Chromium, recordings by the Rerun viewer without a window. On Debian: ``apt install
+chromium mesa-vulkan-drivers``.
 """
 
 import os
-import shutil
+import signal
+import socket
 import subprocess
 import sys
 import sysconfig
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -19,6 +21,7 @@ from typing import Any
 from unittest import mock
 
 from PIL import Image
+from rerun.experimental import ViewerClient
 
 from benchmarks.browser import Browser
 from benchmarks.diagnosis import machine_of, of_scenario
@@ -36,6 +39,8 @@ START = 1_790_000_000.0  # Unix s of the first window
 COUNT = 60  # windows
 SEED = 5
 SIZE = (1280, 720)  # pixels
+PAUSE, TRIES = 5.0, 12  # s between pictures of the viewer, longer than it shows a notice
+BAR = 38  # pixels: of the window of the viewer
 COLOURS = 200  # of a PNG file
 MACHINE, SITE = "press-3", "hall-1"
 FAULTS: dict[str, dict[str, Any]] = {
@@ -91,14 +96,38 @@ def recording_picture(reports: Sequence[Report], folder: Path) -> bytes:
     for report in reports:
         recording.add(report)
     recording.close()
-    width, height = SIZE
-    screen = ["xvfb-run", "-a", "-s", f"-screen 0 {width}x{height}x24"]
-    viewer = [f"{sysconfig.get_path('scripts')}/rerun", "--port", "auto", "--bind", "127.0.0.1", "--renderer", "vulkan"]
-    target = ["--window-size", f"{width}x{height}", "--screenshot-to", str(image), str(path)]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    program, size = f"{sysconfig.get_path('scripts')}/rerun", f"{SIZE[0]}x{SIZE[1] + BAR}"
+    place = ["--headless", "--renderer", "vulkan", "--bind", "127.0.0.1", "--port", f"{port}", "--window-size", size]
     environment = {**os.environ, "XDG_CONFIG_HOME": str(folder)}
-    subprocess.run([viewer[0], "analytics", "disable"], env=environment, capture_output=True, check=True)  # noqa: S603 - our viewer
-    subprocess.run([*screen, *viewer, *target], env=environment, capture_output=True, check=True, timeout=180)  # noqa: S603 - our viewer
-    return image.read_bytes()
+    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=True)  # noqa: S603 - our viewer
+    with subprocess.Popen([program, *place, str(path)], env=environment, stdout=subprocess.DEVNULL,  # noqa: S603 - our viewer
+                          stderr=subprocess.DEVNULL, start_new_session=True) as viewer:  # fmt: skip
+        try:
+            return _without_bar(_settled(port, image))
+        finally:
+            os.killpg(viewer.pid, signal.SIGKILL)
+
+
+def _settled(port: int, image: Path) -> bytes:
+    """Return the first picture of a viewer that is like the one before: all is loaded, and its notices are gone."""
+    before = b""
+    for _ in range(TRIES):
+        time.sleep(PAUSE)
+        ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image))
+        if (shown := image.read_bytes()) == before:
+            return shown
+        before = shown
+    sys.exit(f"{image.name}: the viewer shows something else in each of {TRIES} pictures")
+
+
+def _without_bar(picture: bytes) -> bytes:
+    """Return a picture without the bar of the window, which has notices about the computer that made it."""
+    output, whole = BytesIO(), Image.open(BytesIO(picture))
+    whole.crop((0, BAR, *whole.size)).save(output, "PNG")
+    return output.getvalue()
 
 
 def reduced(picture: bytes, size: tuple[int, int] = SIZE) -> bytes:
@@ -112,10 +141,7 @@ def reduced(picture: bytes, size: tuple[int, int] = SIZE) -> bytes:
 
 
 def write_situations(folder: Path, tab: Browser) -> None:
-    """Write report and recording of each situation into ``folder``; without Xvfb recordings stay as they are."""
-    has_screen = shutil.which("xvfb-run") is not None
-    if not has_screen:
-        print("xvfb-run is not installed: the pictures of recordings stay as they are", file=sys.stderr)
+    """Write report and recording of each situation into ``folder``."""
     with tempfile.TemporaryDirectory() as name:
         for situation in FAULTS:
             place = Path(name) / situation
@@ -125,5 +151,4 @@ def write_situations(folder: Path, tab: Browser) -> None:
             file.write_text(page(reports, place), encoding="utf-8")
             tab.open(file, *SIZE)
             (folder / f"report-{situation}.png").write_bytes(reduced(tab.picture()))
-            if has_screen:
-                (folder / f"recording-{situation}.png").write_bytes(reduced(recording_picture(reports, place)))
+            (folder / f"recording-{situation}.png").write_bytes(reduced(recording_picture(reports, place)))

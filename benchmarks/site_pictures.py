@@ -2,13 +2,16 @@
 
 from collections.abc import Iterator
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 
 from benchmarks.browser import Browser
 from benchmarks.pictures import reduced, simulated
 from otolith.health.times import moment_text
 from otolith.publishing.zenoh_session import REPORT
-from otolith.site.hall import Filter, Hall
+from otolith.site.app import FIRST_PEERS
+from otolith.site.compare import peers, poor_data, week
+from otolith.site.hall import PAGES, Filter, Hall
 from otolith.site.known import Knowledge
 from otolith.site.words import words_in
 
@@ -34,20 +37,29 @@ def knowledge() -> tuple[Knowledge, float]:
     return known, now
 
 
-def page() -> str:
-    """Return the page of the hall, with its style in it, for a browser without a server."""
+def pages() -> dict[str, str]:
+    """Return the hall and the comparison, with their style in them, for a browser without a server."""
     known, now = knowledge()
     frame = {"title": "Works 2", "words": words_in("en"), "time": moment_text(now, ZONE), "dropped": 0}
-    html = b"".join(Hall(known, ZONE).shown(now, "en").page(Filter(), "", frame)).decode()
+    hall = b"".join(Hall(known, ZONE).shown(now, "en").page(Filter(), "", frame)).decode()
+    rows = {"peers": peers(known, now, "en"), "poor": poor_data(known, now, "en", ZONE)}
+    comparison = PAGES.get_template("compare.html").render(
+        rows, events=week(known, now, "en", ZONE), first=FIRST_PEERS, here="compare", language="en", refused={}, **frame
+    )
     style = files("otolith.site").joinpath("pages", "site.css").read_text(encoding="utf-8")
-    html = html.replace('<link rel="stylesheet" href="/site.css">', f"<style>{style}</style>")
-    return html.replace('<script src="/site.js" defer></script>', "")
+    parts = {'<link rel="stylesheet" href="/site.css">': f"<style>{style}</style>",
+             '<script src="/site.js" defer></script>': ""}  # fmt: skip
+    found = {"site": hall, "site-compare": comparison}
+    for key, part in product(found, parts):
+        found[key] = found[key].replace(part, parts[part])
+    return found
 
 
 def pictures(tab: Browser, folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of the pictures; ``folder`` takes the page."""
-    file = folder / "hall.html"
-    file.write_text(page(), encoding="utf-8")
-    for width, size in SIZES.items():
-        tab.open(file, *size, is_phone=width == "390")
-        yield f"site-{width}", reduced(tab.picture(), size)
+    """Yield name and content of the pictures; ``folder`` takes the pages."""
+    for name, html in pages().items():
+        file = folder / f"{name}.html"
+        file.write_text(html, encoding="utf-8")
+        for width, size in SIZES.items():
+            tab.open(file, *size, is_phone=width == "390")
+            yield f"{name}-{width}", reduced(tab.picture(), size)

@@ -1,12 +1,16 @@
 """Machines of one twin beside each other, and the events of a week."""
 
+import re
+
 import pytest
 
 from otolith.acquisition.window import Verdict
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument
 from otolith.site.compare import MIN_PEERS, WEEK, peers, poor_data, week
+from otolith.site.hall import PAGES
 from otolith.site.known import Knowledge
+from otolith.site.words import words_in
 from tests.sites.machines import raised, report_of, sent
 from tests.storage.histories import START
 
@@ -33,6 +37,18 @@ def test_a_machine_that_differs_from_its_peers_is_marked(values: tuple[float, ..
     assert len(rows) == len(values)
     assert len(values) >= MIN_PEERS or not marked
     assert rows[0].machine.name == f"m-{values.index(max(values))}"  # the nearest to its limit first
+
+
+def test_the_nearest_to_a_limit_and_those_that_differ_are_seen_at_once_and_each_machine_once() -> None:
+    knowledge = known(*(6.5 + 0.001 * index for index in range(20)), 4.0)
+    html = PAGES.get_template("compare.html").render(
+        peers=peers(knowledge, START, "en"), poor=[], events=[], first=3, here="compare", language="en", refused={},
+        words=words_in("en"), title="Works", time="now", dropped=0,
+    )  # fmt: skip
+    seen = re.findall(r">(m-\d+)</a>", html.partition("<details")[0])
+    assert seen[:3] == ["m-19", "m-18", "m-17"]
+    assert [row.machine.name for row in peers(knowledge, START, "en")["dc_motor", "R_a"] if row.is_outlier] == seen[3:]
+    assert sorted(re.findall(r">(m-\d+)</a>", html)) == sorted(f"m-{index}" for index in range(21))
 
 
 def test_one_machine_has_no_peers() -> None:

@@ -283,6 +283,9 @@ def test_pages_are_readable_in_a_browser_and_ask_nobody_else(
         assert {re.sub(r"(?<=\d)/.*", "/", each) for each in tab.requested() if each != "data:,"} == {site.address}
         assert tab.value("innerWidth") == width
         assert tab.value("document.documentElement.scrollWidth") <= width
+        if path == "/compare":  # a phone has no room for columns
+            shown = tab.value("getComputedStyle(document.querySelector('.table tr')).display")
+            assert (shown == "block") is (width < 500)
 
 
 def test_a_fault_shows_in_an_open_browser_without_asking_again(site: Served, running: Running, tab: Browser) -> None:

@@ -369,8 +369,8 @@ class Demo:
 
     def _table(self, rows: list[Comparison]) -> Table:
         step = max(1, len(rows) // MAX_ROWS)
-        every = "" if step == 1 else f", one of {step}"
-        table = Table(title=f"injected and estimated: windows that determine the parameters{every}")
+        every = "" if step == 1 else f", one window of {step}"
+        table = Table(title=f"injected and estimated{every}")
         for column in ("window", "parameter", "injected", "estimated ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
         units = {parameter.name: parameter.unit for parameter in self._machine.problem.free}

@@ -279,7 +279,7 @@ def _held(key: str, before: Mapping[str, Level], past: Past) -> tuple[Level, flo
 def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
     """Return on which side of a limit a value is."""
     side = texts(limit.side if limit.excess(value) > 0.0 else "still_near")
-    return texts("beside", side=side, limit=quantity_text(limit.value, unit, digits=4))
+    return texts("beside", side=side, limit=quantity_text(limit.value, unit))
 
 
 def coldness_of(plan: MonitoringPlan, before: Mapping[str, Coldness], report: ReportDocument) -> dict[str, Coldness]:
@@ -343,7 +343,7 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
     expected = forecast_text(parameter, report.window.end, plan.language)
     what = {"what": plan.texts.translated(quantity.meaning), "name": name, "expected": expected}
     what |= {"value": interval_text(*referred, parameter.unit), "at": _at_temperature(quantity, plan.texts)}
-    text = plan.texts("trend", **what, limit=quantity_text(crossing.limit, parameter.unit, digits=4))
+    text = plan.texts("trend", **what, limit=quantity_text(crossing.limit, parameter.unit))
     return Observation(key, quantity.part, severity(plan.rules, features), features, text)
 
 

@@ -109,14 +109,22 @@ def _pattern(phrase: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)
 
 
-REWORDED = ("changed", "not_yet", "no_longer", "no_baseline", "no_temperature", "class_in_words")
-"""Texts of reports that are known by their sentence alone, so that a reader gets them in another language."""
+SENTENCES = ("colder", "trend", "moved", "limit", "component", "returns", "lost",
+             "changed", "not_yet", "no_longer", "no_baseline", "no_temperature", "class_in_words")  # fmt: skip
+"""Texts of reports, by which a sentence in one language becomes one in another."""
+INNER = {"side": ("below", "above", "still_near"), "beside": ("beside",), "change": ("of_baseline", "at_temperature"),
+         "at": ("at_temperature",), "expected": ("reaches_between", "reaches_after", "reaches", "cooled"),
+         "warming": ("warming",), "value": ("unknown", "at_temperature")}  # fmt: skip
+"""The texts that are parts of these, by their names in braces."""
+SHAPES = {"what": ".{1,80}?", "name": r"\S{1,64}", "value": "[^:,;()]+", "change": r"(?: \(.*?\))?",
+          "beside": "(?:(?:, )?[^,;()]+)?", "expected": "[^;]*", "warming": "(?:; .*)?", "at": "(?: .*?)?"}  # fmt: skip
+"""What stands for a name in braces; any text for the others."""
 
 
 def report_in(report: ReportDocument, language: Language | None, zone: str | None = None) -> ReportDocument:
     """Return a report in the language and zone of its reader, by default in those of the machine.
 
-    Sentences with values, and the texts of rules of the machine file, stay in the language of the machine.
+    The texts of rules of the machine file stay in the language of the machine.
     """
     if (health := report.health) is None:
         return report
@@ -151,12 +159,55 @@ def event_in(event: EventDocument, language: Language | None, zone: str | None =
 
 
 def _reworded(text: str, source: Texts, target: Texts) -> str:
-    """Return a text in another language, as far as it is known there."""
-    is_known = source is not target and len(text) <= MAX_SENTENCE
-    for key in REWORDED if is_known else ():
-        if match := _pattern(source.texts[key]).fullmatch(text):
-            return target(key, **match.groupdict())
-    return target.translated(text)
+    """Return a sentence of a report in another language, as far as it is known there."""
+    if source is target or len(text) > MAX_SENTENCE:
+        return target.translated(text)
+    return _sentence_in(text, source.language, target.language)
+
+
+@lru_cache(maxsize=4096)
+def _sentence_in(text: str, from_language: Language, to_language: Language) -> str:
+    source, target = texts_in(from_language), texts_in(to_language)
+    for key in SENTENCES:
+        if match := _sentence(source.texts[key]).fullmatch(text):
+            return target(key, **{name: _part(name, part, source, target) for name, part in match.groupdict().items()})
+    return _known_word(text, source, target)
+
+
+@lru_cache
+def _sentence(template: str) -> re.Pattern[str]:
+    """Return the expression of a whole sentence."""
+
+    def shape(name: re.Match[str]) -> str:
+        return f"(?P<{name[1]}>{SHAPES.get(name[1], '.*?')})"
+
+    return re.compile(re.sub(r"\\{(\w+)\\}", shape, re.escape(template)), re.DOTALL)
+
+
+def _part(name: str, text: str, source: Texts, target: Texts) -> str:
+    """Return a part of a sentence in another language: its words become others, and its numbers stay."""
+    if name in ("what", "reason", "level"):
+        return _known_word(text, source, target)
+    for key in INNER.get(name, ()):
+
+        def own(match: re.Match[str], key: str = key) -> str:
+            return target(key, **{name: _part(name, part, source, target) for name, part in match.groupdict().items()})
+
+        text = _inner(source.texts[key]).sub(own, text)
+    return text
+
+
+@lru_cache
+def _inner(template: str) -> re.Pattern[str]:
+    """Return the expression of a part within a longer one: a name in braces ends at a comma, semicolon or bracket."""
+    end = "(?![^,;()])" if "{" in template else ""
+    return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^,;()]*?)", re.escape(template)) + end)
+
+
+def _known_word(text: str, source: Texts, target: Texts) -> str:
+    """Return a phrase in another language."""
+    english = next((own for own, phrase in source.phrases.items() if phrase == text and "{" not in own), text)
+    return target.translated(english)
 
 
 def interval_text(value: float, sd: float, unit: str) -> str:
