@@ -39,6 +39,15 @@ def test_a_machine_that_differs_from_its_peers_is_marked(values: tuple[float, ..
     assert rows[0].machine.name == f"m-{values.index(max(values))}"  # the nearest to its limit first
 
 
+@pytest.mark.parametrize(("sd", "is_marked"), [(0.001, True), (0.05, False)])
+def test_a_machine_whose_interval_holds_the_median_does_not_differ(sd: float, is_marked: bool) -> None:
+    knowledge, report = known(*(6.5,) * 6), report_of("wide", value=6.53)
+    row = report.parameters["R_a"].model_copy(update={"sd": sd})
+    knowledge.take(*sent(report.model_copy(update={"parameters": {"R_a": row}})), START)
+    (rows,) = peers(knowledge, START, "en").values()
+    assert [row.machine.name for row in rows if row.is_outlier] == ["wide"] * is_marked
+
+
 def test_the_nearest_to_a_limit_and_those_that_differ_are_seen_at_once_and_each_machine_once() -> None:
     knowledge = known(*(6.5 + 0.001 * index for index in range(20)), 4.0)
     html = PAGES.get_template("compare.html").render(

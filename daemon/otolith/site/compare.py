@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from otolith.acquisition.window import Verdict
+from otolith.estimation.information import QUANTILE
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, Language, ParameterDocument
 from otolith.health.text import event_in, texts_in, value_text, zone_of
@@ -90,7 +91,7 @@ def peers(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[st
         if len(rows) < 2:
             continue
         rows.sort(key=lambda row: -row[2])
-        away = _outliers([share for *_, share in rows])
+        away = _outliers([share for *_, share in rows], [_reach(row) for _, row, _ in rows])
         found[key] = [
             Peer(
                 machine, visible(say.decimals(say.translated(value_text(row)))),
@@ -103,13 +104,23 @@ def peers(knowledge: Knowledge, now: float, language: Language) -> dict[tuple[st
     return found
 
 
-def _outliers(shares: list[float]) -> list[bool]:
-    """Return which values differ from the others, by the modified z-score of Iglewicz and Hoaglin (1993)."""
+def _reach(parameter: ParameterDocument) -> float:
+    """Return half of the 95 % interval of a parameter with a limit, as a share of the way to this."""
+    healthy = parameter.nominal if parameter.baseline is None else parameter.baseline
+    return QUANTILE * (parameter.sd or 0.0) / abs((parameter.limit or 0.0) - healthy)
+
+
+def _outliers(shares: list[float], reaches: list[float]) -> list[bool]:
+    """Return which values differ from the others, by the modified z-score of Iglewicz and Hoaglin (1993).
+
+    One whose interval, of half ``reaches``, holds the median of the others does not.
+    """
     if len(shares) < MIN_PEERS:
         return [False] * len(shares)
     middle = statistics.median(shares)
     spread = statistics.median(abs(share - middle) for share in shares)
-    return [CONSISTENT * abs(share - middle) > OUTLIER * max(spread, 1e-3) for share in shares]
+    least = OUTLIER * max(spread, 1e-3) / CONSISTENT
+    return [abs(share - middle) > max(least, reach) for share, reach in zip(shares, reaches, strict=True)]
 
 
 def week(knowledge: Knowledge, now: float, language: Language, zone: str | None) -> list[TimedEvent]:
