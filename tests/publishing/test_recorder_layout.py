@@ -91,7 +91,7 @@ def test_each_parameter_has_nominal_value_and_near_limits_all_the_time(recorded:
     assert np.unique(np.array(values), axis=0) == pytest.approx(np.array([[6.5, 6.37, 6.175]]))
     plan = load_machine(EXAMPLES / "dc-motor.toml", with_driver=False).plan
     names = [name for name, _, _ in limit_lines(plan.parameters["R_a"], plan.texts)]
-    assert names == ["nominal 6.5 Ω", "WATCH 6.37 Ω", "ACT 6.175 Ω", "WATCH 9.425 Ω", "ACT 10.72 Ω"]
+    assert names == ["nominal 6.5 Ω", "WATCH 6.37 Ω", "ACT 6.175 Ω", "WATCH 9.425 Ω", "ACT 10.725 Ω"]
 
 
 def test_a_far_limit_is_shown_to_a_value_near_it() -> None:

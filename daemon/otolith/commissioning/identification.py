@@ -59,15 +59,15 @@ MAX_PLAUSIBLE_FACTOR = 10.0  # on process noise: beyond it, noise is hardly the 
 
 NEVER_MEASURED = "no window has a sample of it: its level is unchanged"
 CONSTANT = "the signal is constant, so its noise cannot be identified: its level is unchanged"
-UPPER_BOUND = "upper bound: the process noise hides how much better the sensor may be"
+UPPER_BOUND = "upper bound: process noise masks the noise of the sensor, which may be smaller"
 NOT_OBSERVABLE = "no output depends on it"
 AT_REST = "nothing moves in these windows, so its process noise cannot be identified"
 NOT_SIGNIFICANT = "not significant: up to about {:.1g} {} per square root of a second cannot be detected"
 NO_WINDOW = "no window can be used: nothing was identified"
-EXCLUDED = "windows excluded because they are badly sampled, too short, or the twin cannot follow them: {} of {}"
+EXCLUDED = "windows excluded because they are badly sampled, too short, or the twin does not explain them: {} of {}"
 EXCLUDED_AT_REST = "windows excluded because nothing moves in them: {} of {}"
 EXCLUDED_OUTLYING = (
-    "windows excluded because they contradict all others: {} of {}, from {}: a standstill, a disturbance or a change "
+    "windows excluded because they do not fit all others: {} of {}, from {}: a standstill, a disturbance or a change "
     "of the machine; the levels do not hold there"
 )
 CHANGED = "the machine changes at about {}: windows before and after it were compared among themselves only"

@@ -48,7 +48,7 @@ from otolith.health.text import PARTS, duration_text, reasons_of
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
 OF_DATA = ("data", "source/", "temperature/", OUTPUT)  # Begins of the keys of conditions that nothing was learned for
-CONTRADICTED = "the last windows contradict the estimates that a forecast is made from"
+CONTRADICTED = "the last windows do not fit the estimates that a forecast is made from"
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
 NAMED = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})  # Of windows that are estimated: its cause is known
 

@@ -416,7 +416,7 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     limits = sorted(quantity.limits, key=lambda row: abs(row.value - quantity.nominal))
     rows = [("nominal", quantity.nominal, LIMIT), *((str(row.level), row.value, STATES[row.level]) for row in limits)]
     say, unit = texts.translated, quantity.unit
-    shown = [(f"{say(name)} {quantity_text(value, unit, digits=4)}", value, colour) for name, value, colour in rows]
+    shown = [(f"{say(name)} {quantity_text(value, unit)}", value, colour) for name, value, colour in rows]
     return [(texts.decimals(text), value, colour) for text, value, colour in shown]
 
 
