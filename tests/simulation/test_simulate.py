@@ -15,6 +15,7 @@ from otolith.estimation.problem import Component, augment
 from otolith.machine import library_twins
 from otolith.simulation.draws import root_of
 from otolith.simulation.initial_state import last_state, state_covariance
+from otolith.simulation.orders import with_whole_orders
 from otolith.simulation.plan import planned_window
 from otolith.simulation.simulate import simulate
 from otolith.simulation.what_if import with_value, without_component
@@ -152,6 +153,20 @@ def test_a_simulation_begins_with_the_phases_of_the_last_record() -> None:
     (inner, phase) = ([item.name for item in twin.free].index(name) for name in ("_inner_0", "_phase_0"))
     state = state.reset_value(inner, 1.0, 1e-6).reset_value(phase, 0.3, 1e-3)
     assert np.sin(state.at_last_record().prior().mean[phase]) == pytest.approx(np.sin(0.3 + 11.9), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("order", "sd", "expected"),
+    [(1.0003, 3e-4, 1.0), (3.9995, 5e-4, 4.0), (1.003, 3e-4, 1.003), (1.02, 0.05, 1.02), (0.004, 1e-3, 0.004)],
+    ids=["once per turn", "four times", "excluded", "not known well enough", "none"],
+)
+def test_an_order_of_a_whole_number_counts_as_whole(order: float, sd: float, expected: float) -> None:
+    twin = augment(problem(), [Component("shaft", "periodic", "angle(omega)", 0.005, 1.0, 0.3, 0.001, 9.0)])
+    state = posterior(own=problem()).remap_parameters(twin)
+    inner = [item.name for item in twin.free].index("_inner_0")
+    found = with_whole_orders(state.reset_value(inner, order, sd)).prior()
+    assert found.mean[inner] == pytest.approx(expected, rel=1e-9)
+    assert found.sd[inner] == pytest.approx(sd if expected == order else 0.0, abs=1e-12)
 
 
 def test_before_any_window_the_state_is_not_known() -> None:

@@ -75,6 +75,10 @@ def test_a_restored_state_gives_the_same_reports_bit_for_bit(
         assert own.dtype == other.dtype
         assert own.tobytes() == other.tobytes()
     assert warm.posterior.belief.end == state.posterior.belief.end
+    modes = [each.posterior.with_constants().belief for each in (warm, state)]
+    assert len(modes[0].weight) > len(warm.posterior.belief.weight)
+    for name in ("level", "mean", "covariance", "weight"):
+        assert getattr(modes[0], name).tobytes() == getattr(modes[1], name).tobytes()
     assert warm.adopted == state.adopted
     after = windows(simulate_motor("sweep", 4.0, Faults(), seed=4), START + 26.0)
     reports = [[report.to_json() for report in run(each, after)[1]] for each in (warm, state)]
@@ -242,6 +246,9 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "weights": (with_value("filter", "weight", 0, value=0.9), "weight"),
     "level": (with_value("filter", "level", 0, 0, value=9), "level"),
     "modes": (with_value("filter", "level", 0, value=[0]), "inhomogeneous"),
+    "constants of others": (with_value("filter", "constant", "mean", value=[1.0]), "constant"),
+    "constants far off": (with_value("filter", "constant", "mean", 0, value=50.0), "outside"),
+    "constants for sure": (with_value("filter", "constant", "probability", value=1.0), "probability"),
     "variance ratio": (with_value("filter", "variance_ratio", value=0.1), "variance_ratio"),
     "scale": (with_value("filter", "scale", 0, value=1.0), "scale"),
     "labels": (with_value("filter", "labels", 0, value="R_b"), "labels"),

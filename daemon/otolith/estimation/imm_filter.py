@@ -8,6 +8,12 @@ one level lower, one level higher, or at the highest level; all others are raise
 of the mode (moving model set: X. R. Li, Y. Bar-Shalom, IEEE Transactions on Automatic Control 41, 1996).
 ``docs/explanation/filter.md`` has the equations.
 
+The bank never excludes a trend that is possible but not there: the mixing returns its variance to each mode in each
+window, and a prediction far ahead needs that it is excluded. So there is a further mode, in which all parameters are
+constant. It takes from the bank as modes do, and loses the trends of what it takes (Y. Bar-Shalom, X. R. Li, T.
+Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.6). The bank takes nothing from it, and
+predictions of what follows alone read it: a drift that begins contradicts it, and is no reason for a search.
+
 All numbers are relative to the sizes of the parameters; :mod:`otolith.estimation.posterior` converts.
 """
 
@@ -21,8 +27,10 @@ from otolith.acquisition.window import Array
 from otolith.estimation.evidence import chi_square_limit, likelihood_ratios, log_determinant
 from otolith.estimation.information import Evidence
 
-TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
-HIGHEST_LEVEL = len(TREND_NOISE) - 1
+# 1/s^1.5: process noise of a trend, relative to the parameter; the last one of a parameter that is constant
+TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4, 0.0])
+CONSTANT = -1  # level of a parameter without trend, in the mode of constants
+HIGHEST_LEVEL = len(TREND_NOISE) - 2
 FIRST_LEVEL = HIGHEST_LEVEL  # before the first window: a parameter may already be drifting
 ADDED_LEVEL = 2  # of a parameter that a hypothesis adds
 MAX_LEVELS_BELOW = 1  # levels of a parameter below the highest of its mode: either of two correlated ones may drift
@@ -328,6 +336,15 @@ def project(posterior: ImmPosterior, index: int, low: float, high: float) -> Imm
     return replace(posterior, mean=posterior.mean + gains * beyond[:, None])
 
 
+def condition(posterior: ImmPosterior, index: int, value: float) -> ImmPosterior:
+    """Return the posterior given that the entry at ``index`` is exactly ``value``; correlated entries move with it."""
+    variance = posterior.covariance[:, index, index, None]
+    gains = posterior.covariance[:, :, index] / np.where(variance > 0.0, variance, 1.0)  # its row is zero as well
+    mean = posterior.mean + gains * (value - posterior.mean[:, index])[:, None]
+    covariance = posterior.covariance - gains[:, :, None] * posterior.covariance[:, None, :, index]
+    return reset_marginal(replace(posterior, mean=mean, covariance=covariance), index, 0.0, value)
+
+
 def set_all_modes(posterior: ImmPosterior, mean: Array, covariance: Array) -> ImmPosterior:
     """Return the posterior with the same mean (2 free,) and covariance (2 free, 2 free) in every mode."""
     modes = len(posterior.weight)
@@ -340,3 +357,74 @@ def _block_diagonal(block: Array, weight: Array) -> Array:
     apart = weight[..., None, :, None, None] * np.eye(free)[:, None, :]  # (..., 1, free, 1, free)
     blocks: Array = (block[:, None, :, None] * apart).reshape(*weight.shape[:-1], 2 * free, 2 * free)
     return blocks
+
+
+def constant_mode(bank: ImmPosterior) -> ImmPosterior:
+    """Return the mode before any window speaks for it: values as the ``bank`` knows them, without trends.
+
+    It has the probability of a mode that enters: a parameter may be drifting.
+    """
+    mean, covariance = _values_alone(bank)
+    level = np.full((1, len(mean) // 2), CONSTANT)
+    weight = np.array([NEW_MODE_WEIGHT])
+    return ImmPosterior(level, mean[None], covariance[None], weight, bank.end, bank.variance_ratio)
+
+
+def predict_constants(mode: ImmPosterior, bank: ImmPosterior, end: float) -> ImmPosterior:
+    """Return the mode at ``end`` (s on the clock of the windows); it and the ``bank`` are those of the last window.
+
+    If ``end`` lies before that, as in a log that begins again, it begins anew.
+    """
+    if end < bank.end:
+        return replace(constant_mode(bank), end=end)
+    if end == bank.end or not np.isfinite(bank.end):
+        return replace(mode, end=end)
+    mean, covariance = _values_alone(bank)
+    (before,) = mode.weight
+    weight = STAY_PROBABILITY * before + (1.0 - STAY_PROBABILITY) * (1.0 - before)
+    share = (1.0 - STAY_PROBABILITY) * (1.0 - before) / weight  # of the bank in it
+    offset = mean - mode.mean[0]
+    spread = share * (1.0 - share) * np.outer(offset, offset)
+    mixed = (1.0 - share) * mode.covariance[0] + share * covariance + spread
+    return replace(mode, mean=mode.mean + share * offset, covariance=mixed[None], weight=np.array([weight]), end=end)
+
+
+def update_constants(mode: ImmPosterior, innovation: Innovation) -> ImmPosterior:
+    """Return the predicted ``mode`` after a window, of which the ``innovation`` is that of the bank."""
+    bank, root = innovation.prediction, innovation.sqrt_information
+    value = innovation.value[0] + root @ (mode.mean[0] - bank.mean[0])
+    spread = np.eye(len(root)) + root @ mode.covariance[0] @ root.T
+    gain = np.linalg.solve(spread, root @ mode.covariance[0]).T
+    kept = np.eye(len(mode.mean[0])) - gain @ root  # Joseph form
+    covariance = kept @ mode.covariance[0] @ kept.T + gain @ gain.T
+    own = float(value @ np.linalg.solve(spread, value)) + float(log_determinant(spread))
+    of_bank = innovation.nis_of_mode + log_determinant(innovation.covariance)
+    against = float(np.logaddexp.reduce(np.log(bank.weight) - 0.5 * of_bank)) + 0.5 * own  # log of the Bayes factor
+    odds = mode.weight / (1.0 - mode.weight) * np.exp(-np.clip(against, -700.0, 700.0))
+    weight = np.clip(odds / (1.0 + odds), MIN_MODE_WEIGHT, 1.0 - MIN_MODE_WEIGHT)
+    return replace(
+        mode,
+        mean=mode.mean - (gain @ value)[None],
+        covariance=0.5 * (covariance + covariance.T)[None],
+        weight=weight,
+    )
+
+
+def with_constants(bank: ImmPosterior, mode: ImmPosterior) -> ImmPosterior:
+    """Return all modes, each with its probability: for a prediction of what follows."""
+    return replace(
+        bank,
+        level=np.concatenate([bank.level, mode.level]),
+        mean=np.concatenate([bank.mean, mode.mean]),
+        covariance=np.concatenate([bank.covariance, mode.covariance]),
+        weight=np.append((1.0 - mode.weight) * bank.weight, mode.weight),
+    )
+
+
+def _values_alone(bank: ImmPosterior) -> tuple[Array, Array]:
+    """Return mean (2 free,) and covariance (2 free, 2 free) of the values in all modes; those of trends are zero."""
+    mean, covariance = moment_match(bank)
+    free = len(mean) // 2
+    mean[free:] = 0.0
+    covariance[free:] = covariance[:, free:] = 0.0
+    return mean, covariance

@@ -5,7 +5,7 @@ times time, or by order times shaft angle. A tracked component therefore stays c
 more certain. Where the advance is not known, the phase is reset to unknown.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -59,6 +59,9 @@ class Posterior:
     problem: Problem
     belief: ImmPosterior  # Relative to the sizes of the parameters
     phase: PhaseAdvance | None = None  # None before the first window
+    constant: ImmPosterior | None = None
+    """The mode of constants. None before the first window, and after anything but a window
+    has changed the belief: the next window begins it anew."""
 
     @classmethod
     def initial(cls, problem: Problem) -> "Posterior":
@@ -68,8 +71,13 @@ class Posterior:
 
     def predict(self, window: Window) -> "Posterior":
         """Return the prediction: phases at the first record of ``window``, parameters at its end."""
-        belief = self._propagate_phases(window.start, window.sample_period)
-        return replace(self, belief=imm_filter.predict(belief, window.end))
+        last = self._propagate_phases(window.start, window.sample_period)
+        mode = last.constant or imm_filter.constant_mode(last.belief)
+        return replace(
+            last,
+            belief=imm_filter.predict(last.belief, window.end),
+            constant=imm_filter.predict_constants(mode, last.belief, window.end),
+        )
 
     def at_last_record(self) -> "Posterior":
         """Return the same with phases at the last record of the last window, where :attr:`PhaseAdvance.last_state` is.
@@ -88,11 +96,12 @@ class Posterior:
             rate = phase.last_state[names.index(speed)] if speed in names and phase.last_state else 0.0
             by.append(advance - step * (rate if symbol.startswith("_angle_") else 1.0))
         last = replace(phase, next_start=phase.next_start - step, by=tuple(by))
-        return replace(self, belief=replace(self, phase=last)._propagate_phases(last.next_start, max(step, 1e-9)))
+        return replace(replace(self, phase=last)._propagate_phases(last.next_start, max(step, 1e-9)), phase=phase)
 
     def propagate_phases(self, advance: PhaseAdvance, window: Window) -> "Posterior":
         """Return the same with phases at the first record of ``window``, which ``advance`` leads to."""
-        return replace(self, belief=replace(self, phase=advance)._propagate_phases(window.start, window.sample_period))
+        moved = replace(self, phase=advance)._propagate_phases(window.start, window.sample_period)
+        return replace(moved, phase=self.phase)
 
     def prior(self) -> Prior:
         """Return all modes as one normal distribution, in the units of the parameters."""
@@ -166,24 +175,33 @@ class Posterior:
         Inner parameters of components stay within the bounds of their search, widened by ``INNER_BOUND``: far beyond
         them a shape means something else.
         """
-        belief = imm_filter.update(innovation)
+        beliefs = [imm_filter.update(innovation)]
+        if self.constant is not None:
+            beliefs.append(imm_filter.update_constants(self.constant, innovation))
         for slot, component in enumerate(self.problem.components):
             if component.model.inner is not None:
                 inner = indices(self.problem, slot)[1]
                 low, high = component.low / INNER_BOUND, component.high * INNER_BOUND
                 scale = float(self.problem.scale[inner])
-                belief = imm_filter.project(belief, inner, low / scale, high / scale)
-        return Posterior(self.problem, belief, phase)
+                beliefs = [imm_filter.project(belief, inner, low / scale, high / scale) for belief in beliefs]
+        return Posterior(self.problem, beliefs[0], phase, beliefs[1] if len(beliefs) > 1 else None)
+
+    def with_constants(self) -> "Posterior":
+        """Return the same with the mode of constants among those of the bank, for a prediction of what follows."""
+        if self.constant is None:
+            return self
+        return replace(self, belief=imm_filter.with_constants(self.belief, self.constant), constant=None)
 
     def moved(self, change: Array) -> "Posterior":
         """Return the same with parameters and trends moved by ``change`` (2 free,), in their units."""
-        return replace(self, belief=replace(self.belief, mean=self.belief.mean + change / _size(self.problem)))
+        belief = replace(self.belief, mean=self.belief.mean + change / _size(self.problem))
+        return replace(self, belief=belief, constant=None)
 
     def set_prior(self, prior: Prior) -> "Posterior":
         """Return the same modes, each with ``prior`` as its distribution."""
         size = _size(self.problem)
         belief = imm_filter.set_all_modes(self.belief, prior.mean / size, prior.covariance / np.outer(size, size))
-        return replace(self, belief=belief)
+        return replace(self, belief=belief, constant=None)
 
     def with_noise(self, problem: Problem, inflation: Array) -> "Posterior":
         """Return the same for a ``problem`` with other noise; standard deviations grow by factors (2 free,).
@@ -191,12 +209,18 @@ class Posterior:
         The variance ratio is one: the noise explains what windows disagreed in.
         """
         covariance = self.belief.covariance * np.outer(inflation, inflation)
-        return replace(self, problem=problem, belief=replace(self.belief, covariance=covariance, variance_ratio=1.0))
+        belief = replace(self.belief, covariance=covariance, variance_ratio=1.0)
+        return replace(self, problem=problem, belief=belief, constant=None)
 
     def reset_value(self, index: int, value: float, sd: float) -> "Posterior":
         """Return the same with an independent ``value`` ± ``sd`` of one parameter or trend, in its unit."""
         scale = _size(self.problem)[index]
-        return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
+
+        def given(belief: ImmPosterior) -> ImmPosterior:
+            return imm_filter.reset_marginal(belief, index, sd / scale, value / scale)
+
+        is_trend = index >= len(self.problem.free)  # the mode of constants has none
+        return replace(self, belief=given(self.belief)) if is_trend else self._with_each(given)
 
     def reset_parameters(self, moved: Iterable[int]) -> "Posterior":
         """Return the same with the initial prior for the parameters at the indices ``moved``, and for their trends.
@@ -210,11 +234,11 @@ class Posterior:
                 sd = float(np.sqrt(prior.covariance[at, at]) / size[at])
                 value = float(prior.mean[at] / size[at])
                 belief = imm_filter.reset_marginal(belief, at, sd, value)
-        return replace(self, belief=belief)
+        return replace(self, belief=belief, constant=None)
 
     def forget_phase(self, index: int) -> "Posterior":
         """Return the same with the phase at ``index`` unknown."""
-        return replace(self, belief=_forget_phase(self.belief, self.problem, index))
+        return self._with_each(lambda belief: _forget_phase(belief, self.problem, index))
 
     def remap_parameters(self, problem: Problem) -> "Posterior":
         """Return what is known for another choice of free parameters; new ones have the initial prior."""
@@ -231,7 +255,7 @@ class Posterior:
         covariance[new, :] = covariance[:, new] = 0.0
         covariance[np.ix_(new, new)] = old_covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
         modes = imm_filter.equal_modes(level, mean, covariance, self.belief.end, self.belief.variance_ratio)
-        return replace(self, problem=problem, belief=modes)
+        return replace(self, problem=problem, belief=modes, constant=None)
 
     def without_slot(self, slot: int) -> "Posterior":
         """Return what is known without the component of a slot; the others keep their values."""
@@ -240,6 +264,26 @@ class Posterior:
             return remapped
         by = tuple(advance for index, advance in enumerate(self.phase.by) if index != slot)
         return replace(remapped, phase=replace(self.phase, by=by))
+
+    def marginal_without(self, slot: int) -> "Posterior":
+        """Return the same modes without the values of the component of a slot, for a prediction of what follows.
+
+        :meth:`without_slot` is for windows to come: there all modes begin with the same probability.
+        """
+        fewer = self.without_slot(slot)
+        labels, count = [free.label for free in self.problem.free], len(self.problem.free)
+        kept = [labels.index(free.label) for free in fewer.problem.free]
+        both = [*kept, *(count + at for at in kept)]
+        ratio = _size(self.problem)[both] / _size(fewer.problem)
+
+        def marginal(belief: ImmPosterior) -> ImmPosterior:
+            covariance = belief.covariance[:, both][:, :, both] * np.outer(ratio, ratio)
+            return replace(
+                belief, level=belief.level[:, kept], mean=belief.mean[:, both] * ratio, covariance=covariance
+            )
+
+        modes = self._with_each(marginal)
+        return replace(modes, problem=fewer.problem, phase=fewer.phase)
 
     def with_steps(self, window: Window) -> "Posterior":
         """Return the posterior with the steps of converters that ``window`` shows."""
@@ -259,41 +303,51 @@ class Posterior:
                 posterior = posterior.without_slot(posterior.problem.components.index(component))
         return posterior
 
-    def _propagate_phases(self, start: float, sample_period: float) -> ImmPosterior:
-        problem, belief, phase = self.problem, self.belief, self.phase
+    def _with_each(self, change: Callable[[ImmPosterior], ImmPosterior]) -> "Posterior":
+        """Return the same with ``change`` made to the bank and to the mode of constants."""
+        return replace(
+            self, belief=change(self.belief), constant=None if self.constant is None else change(self.constant)
+        )
+
+    def _propagate_phases(self, start: float, sample_period: float) -> "Posterior":
+        problem, phase, moved = self.problem, self.phase, self
         if phase is None:
-            return belief
+            return self
         follows = abs(start - phase.next_start) <= START_TOLERANCE * sample_period
         for slot, (component, advance) in enumerate(zip(problem.components, phase.by, strict=True)):
             if not component.periodic:
                 continue
             elapsed = start - phase.start
-            if component.source == "t" and _stays_coherent(belief, problem, slot, elapsed):
-                belief = _advance_phase(belief, problem, slot, elapsed)
+            if component.source == "t" and _stays_coherent(moved.belief, problem, slot, elapsed):
+                moved = moved._advance_phase(slot, elapsed)
             elif component.source == "t":
-                belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
+                moved = moved.forget_phase(indices(problem, slot)[-1])
             elif follows:
-                belief = _advance_phase(belief, problem, slot, advance)
+                moved = moved._advance_phase(slot, advance)
             elif source_of(problem.base_model, component.source).symbol.startswith("_"):
-                belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
-        return belief
+                moved = moved.forget_phase(indices(problem, slot)[-1])
+        return moved
+
+    def _advance_phase(self, slot: int, by: float) -> "Posterior":
+        """Return the same with the phase of a slot advanced by its inner parameter times ``by``, within one turn."""
+        problem, free = self.problem, len(self.problem.free)
+        _, inner, phase = indices(problem, slot)
+        move = np.eye(2 * free)
+        move[phase, inner] = move[free + phase, free + inner] = by * problem.scale[inner] / problem.scale[phase]
+        turn = 2.0 * np.pi / problem.scale[phase]
+        turns = turn * np.rint((self.belief.mean @ move.T)[0, phase] / turn)  # as many in the mode of constants
+
+        def advanced(belief: ImmPosterior) -> ImmPosterior:
+            mean = belief.mean @ move.T
+            mean[:, phase] -= turns
+            return replace(belief, mean=mean, covariance=move @ belief.covariance @ move.T)
+
+        return self._with_each(advanced)
 
 
 def _size(problem: Problem) -> Array:
     """Return the sizes (2 free,) of parameters and trends."""
     return np.concatenate([problem.scale, problem.scale])
-
-
-def _advance_phase(belief: ImmPosterior, problem: Problem, slot: int, by: float) -> ImmPosterior:
-    """Return the belief with the phase of a slot advanced by its inner parameter times ``by``."""
-    _, inner, phase = indices(problem, slot)
-    free = len(problem.free)
-    move = np.eye(2 * free)
-    move[phase, inner] = move[free + phase, free + inner] = by * problem.scale[inner] / problem.scale[phase]
-    mean = belief.mean @ move.T
-    turn = 2.0 * np.pi / problem.scale[phase]
-    mean[:, phase] -= turn * np.rint(mean[0, phase] / turn)
-    return replace(belief, mean=mean, covariance=move @ belief.covariance @ move.T)
 
 
 def _stays_coherent(belief: ImmPosterior, problem: Problem, slot: int, elapsed: float) -> bool:

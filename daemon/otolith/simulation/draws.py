@@ -1,6 +1,6 @@
 """Draws of what is uncertain in a prediction: parameters with their trends, and how they go on.
 
-Draws come in pairs with opposite deviations, so that their mean is that of the posterior to second order.
+Draws come in pairs with opposite deviations, so that their median is that of the posterior where the twin is linear.
 """
 
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ class Prediction:
     units: tuple[str, ...]  # Of the outputs
     start: float  # Time of the first record, s
     offsets: Array  # (records,) time since the first record, s
-    values: Array  # (records, outputs) mean of the draws
+    values: Array  # (records, outputs) median of the draws
     low: Array  # (records, outputs) lower end of the 95 % band
     high: Array  # (records, outputs) upper end
     driving: Array  # (records, inputs) what drove the twin
@@ -64,7 +64,7 @@ class Prediction:
 
 
 def bands(draws: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """Return mean and ends of the 95 % band (records, outputs) of readings with normal ``noise`` (outputs,).
+    """Return median and ends of the 95 % band (records, outputs) of readings with normal ``noise`` (outputs,).
 
     ``draws`` (records, draws, outputs) are values without that noise. A reading is distributed as their mixture of
     normal distributions, so the noise needs no draws of its own.
@@ -80,7 +80,7 @@ def bands(draws: Array, noise: Array) -> tuple[Array, Array, Array]:
         guess = low[rows, output], high[rows, output]
         low[rows, output] = _quantile(chosen, sd, TAIL, guess[0])
         high[rows, output] = _quantile(chosen, sd, 1.0 - TAIL, guess[1])
-    return mean, low, high
+    return np.median(draws, axis=1), low, high
 
 
 def _quantile(draws: Array, sd: float, probability: float, guess: Array) -> Array:

@@ -16,6 +16,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.simulation.draws import PAIRS, ParameterDraws, opposite, root_of
 from otolith.simulation.initial_state import last_state, state_covariance
+from otolith.simulation.orders import with_whole_orders
 from otolith.simulation.plan import planned_window
 from otolith.simulation.prediction import Prediction, bands
 from otolith.twin.kernel import Excitation, kernel_of
@@ -38,7 +39,8 @@ def simulate(state: Posterior, window: Window, seed: int = 1) -> Prediction:
     Raises:
         ValueError: no window has been learned from yet, or the twin diverges at once.
     """
-    return _Simulation.of(state.at_last_record(), window, seed).prediction()
+    known = with_whole_orders(state.with_constants())
+    return _Simulation.of(known.at_last_record(), window, seed).prediction()
 
 
 def substeps_of(state: Posterior) -> int:
@@ -104,14 +106,14 @@ class _Simulation:
             parts.append(bands(np.array(waiting), noise))
         if not parts:
             raise ValueError("the twin diverges at once")
-        mean, low, high = (np.concatenate(column) for column in zip(*parts, strict=True))
-        count, names = len(mean), tuple(output.name for output in twin.outputs)
+        middle, low, high = (np.concatenate(column) for column in zip(*parts, strict=True))
+        count, names = len(middle), tuple(output.name for output in twin.outputs)
         return Prediction(
             outputs=names,
             units=tuple(output.unit for output in twin.outputs),
             start=window.start,
             offsets=window.grid.offsets[:count],
-            values=mean,
+            values=middle,
             low=low,
             high=high,
             driving=self.driving[:count, : len(twin.inputs)],

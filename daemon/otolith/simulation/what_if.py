@@ -65,4 +65,4 @@ def without_component(posterior: Posterior, key: str) -> Posterior:
         raise ConfigurationError(f"{fault}: {hint}")
     slot = slot_of(posterior.problem, known[found[0]])
     assert slot is not None  # noqa: S101 - it is among the components
-    return posterior.without_slot(slot)
+    return posterior.marginal_without(slot)

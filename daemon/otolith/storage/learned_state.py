@@ -27,6 +27,7 @@ from otolith.estimation.imm_filter import (
     MAX_VARIANCE_RATIO,
     ImmPosterior,
     ParameterCusum,
+    constant_mode,
     moment_match,
 )
 from otolith.estimation.information import MAX_TREND
@@ -55,6 +56,14 @@ class _AnyVersion(BaseModel):
     version: int = VERSION
 
 
+class ConstantRecord(StrictModel):
+    """The mode of constants, without its trends."""
+
+    mean: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    probability: Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
 class FilterRecord(StrictModel):
     """The filter across windows; numbers are relative to ``scale`` as in :class:`ImmPosterior`."""
 
@@ -64,6 +73,7 @@ class FilterRecord(StrictModel):
     mean: tuple[tuple[float, ...], ...]
     covariance: tuple[tuple[tuple[float, ...], ...], ...]
     weight: tuple[float, ...]
+    constant: ConstantRecord | None = None  # See Posterior.constant; older files lack it
     end: float
     variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
     phase: PhaseAdvance | None
@@ -183,6 +193,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         labels=labels,
         scale=tuple(problem.scale.tolist()),
         **{name: getattr(belief, name).tolist() for name in ("level", "mean", "covariance", "weight")},
+        constant=_constant_record(state.posterior),
         end=belief.end,
         variance_ratio=belief.variance_ratio,
         phase=state.posterior.phase,
@@ -193,6 +204,14 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
         **{name: getattr(state, name) for name in SCALARS},
     )
+
+
+def _constant_record(posterior: Posterior) -> ConstantRecord | None:
+    mode, free = posterior.constant, len(posterior.problem.free)
+    if mode is None:
+        return None
+    mean, covariance = mode.mean[0, :free].tolist(), mode.covariance[0, :free, :free].tolist()
+    return ConstantRecord(mean=mean, covariance=covariance, probability=float(mode.weight[0]))
 
 
 def _sums(state: AdaptationState, free: int) -> tuple[tuple[float, ...], ...]:
@@ -314,7 +333,21 @@ def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
     if phase is not None:
         states = len(problem.base_model.states)
         _require(len(phase.by) == len(problem.components) and len(phase.last_state) in (0, states), "phase: wrong size")
-    return Posterior(problem, belief, phase)
+    return Posterior(problem, belief, phase, _constant_mode(record, belief, problem))
+
+
+def _constant_mode(record: FilterRecord, bank: ImmPosterior, problem: Problem) -> ImmPosterior | None:
+    """Return the mode of constants of a record, checked; ``bank`` has the other modes."""
+    if (own := record.constant) is None:
+        return None
+    free, mode = len(problem.free), constant_mode(bank)
+    mean, covariance = np.array(own.mean), np.array(own.covariance)
+    _require(mean.shape == (free,) and covariance.shape == (free, free), "constant: wrong shape")
+    low, high = problem.bounds[0] / problem.scale, problem.bounds[1] / problem.scale
+    _require_near(mean, low, high, "constant: mean")
+    _check_covariance(covariance)
+    mode.mean[0, :free], mode.covariance[0, :free, :free] = mean, covariance
+    return replace(mode, weight=np.array([own.probability]))
 
 
 def _shifts(record: FilterRecord) -> ParameterCusum:
