@@ -41,6 +41,17 @@ def sentences(language: Language) -> list[str]:
     return [*found, say("no_temperature", signal="T_w", name="R_a"), say("no_baseline"), say("changed")]
 
 
+def test_a_signal_by_its_meaning_is_translated_with_what_is_said_of_it() -> None:
+    said = "armature current: i is frozen at 3 A for 2 s (20 samples) from t = 4 s although the twin predicts changes"
+    event = EventDocument(id="a", part="sensors", state=Level.ACT, start=0.0, since=0.0, condition="c", text=said,
+                          evidence=EvidenceDocument(windows=(0, 1)))  # fmt: skip
+    german = texts_in("de")
+    subject, rest = (german.translated(part) for part in said.split(": "))
+    assert event_in(event, "de").text == f"{subject}: {rest}"
+    assert "armature" not in subject
+    assert event_in(event.model_copy(update={"text": "R_a: 5"}), "de").text == "R_a: 5"
+
+
 @pytest.mark.parametrize(("machine", "reader"), PAIRS)
 def test_a_sentence_is_the_one_that_a_machine_with_the_language_of_the_reader_says(
     machine: Language, reader: Language

@@ -171,6 +171,9 @@ def _sentence_in(text: str, from_language: Language, to_language: Language) -> s
     for key in SENTENCES:
         if match := _sentence(source.texts[key]).fullmatch(text):
             return target(key, **{name: _part(name, part, source, target) for name, part in match.groupdict().items()})
+    subject, colon, rest = text.partition(": ")
+    if colon and (own := _known_word(subject, source, target)) != subject:  # a signal by its meaning
+        return f"{own}: {_known_word(rest, source, target)}"
     return _known_word(text, source, target)
 
 
