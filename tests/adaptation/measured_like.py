@@ -68,26 +68,44 @@ def motor_windows(seed: int, count: int, have: Imperfections) -> list[Window]:
     frequency, phase = have.frequency * (1.0 + random.uniform(-ALIASED, ALIASED)), random.uniform(0.0, 2.0 * np.pi)
     decay, spread = np.exp(-step / WANDER), have.wandering_load * np.sqrt(-np.expm1(-2.0 * step / WANDER))
     state, load, level, left = np.zeros(2), 0.0, 0.0, 0
-    system, drive = _motor_matrices()
-    values = np.empty((total, len(SIGNALS)))
+    values, parts = np.empty((total, len(SIGNALS))), np.arange(SUBSTEPS) * step
     for record in range(total):
         if not left:
             left, level = int(random.integers(*HELD)), random.uniform(*LEVELS) * random.choice([-1.0, 1.0])
         left -= 1
         ripple = have.current_ripple * np.sin(2.0 * np.pi * frequency * record * PERIOD + phase)
         values[record] = level, 0.0, *_read(state, random, have, record, ripple)
-        for part in range(SUBSTEPS):
-            time = record * PERIOD + part * step
-            voltage = level + have.supply_ripple * np.sin(2.0 * np.pi * frequency * time + phase)
-            load = decay * load + spread * random.normal()
-            rate = system @ state + drive @ (voltage, load)
-            state = state + 0.5 * step * (rate + system @ (state + step * rate) + drive @ (voltage, load))
+        supplied = have.supply_ripple * np.sin(2.0 * np.pi * frequency * (record * PERIOD + parts) + phase)
+        loads = [load := decay * load + change for change in (spread * random.normal(size=SUBSTEPS)).tolist()]
+        state = _moved(state, (level + supplied).tolist(), loads)
     return cut(SIGNALS, values, RECORDS, PERIOD)
+
+
+def _moved(state: Array, voltages: list[float], loads: list[float]) -> Array:
+    """Return current and speed after a record, by steps of the midpoint rule."""
+    (own, cross), (back, damping) = _STEP.tolist()
+    (supply, brake), (driven, braked) = _DRIVEN.tolist()
+    current, speed = state.tolist()
+    for voltage, load in zip(voltages, loads, strict=True):
+        current, speed = (
+            own * current + cross * speed + supply * voltage + brake * load,
+            back * current + damping * speed + driven * voltage + braked * load,
+        )
+    return np.array([current, speed])
 
 
 def _motor_matrices() -> tuple[Array, Array]:
     r_a, l_a, j, k_e, k_t, d = (TRUTH[name] for name in ("R_a", "L_a", "J", "K_e", "K_t", "D"))
     return np.array([[-r_a / l_a, -k_e / l_a], [k_t / j, -d / j]]), np.array([[1.0 / l_a, 0.0], [0.0, -1.0 / j]])
+
+
+def _midpoint(step: float) -> tuple[Array, Array]:
+    """Return what a step of the midpoint rule makes of the state and of the inputs."""
+    system, drive = _motor_matrices()
+    return np.eye(2) + step * system + 0.5 * step**2 * system @ system, step * drive + 0.5 * step**2 * system @ drive
+
+
+_STEP, _DRIVEN = _midpoint(PERIOD / SUBSTEPS)
 
 
 def _read(
