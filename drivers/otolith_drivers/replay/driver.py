@@ -1,36 +1,41 @@
 """The replay driver: a recorded file instead of a machine, in real time or as fast as its samples are taken.
 
-    file -> [thread replay-read] chunks of rows -> [thread replay] samples at their time
+    file -> [threads replay-read] chunks of rows -> [thread replay] samples at their time
 
-A chunk is read while the one before it is delivered, so that reading delays no sample.
+A chunk is read while the one before it is delivered, so that reading delays no sample. All drivers of a process share
+these threads (:mod:`otolith_drivers.replay.player`).
 """
 
 import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
-from otolith_drivers.common.reconnection import ThreadedDriver
+from otolith_drivers.common.reconnection import CLOSE_TIMEOUT
 from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
+from otolith_drivers.replay.player import Played, Playing, player, reading
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames
 
 # Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
-QUEUE_POLL = 0.1  # s; delay of a stop while a chunk is awaited
-MAX_WAIT = 0.2  # s; delay of a stop while the next row is awaited: a driver must close within 1 s
+CHUNK_POLL = 0.005  # s between two looks whether a chunk is read
+GATHERED = 0.02  # s between two deliveries at least: their rows have their own times, and a wake-up costs more than one
+MAX_WAIT = 10.0  # s; the times of rows are taken from the clock at least so often
 MAX_ROWS_AT_ONCE = 500  # delivered together; bounds how long one call of deliver() takes
 SILENCE_WARNING = 60.0  # s without a row in the file, after which the link warns
 
 log = logging.getLogger(__name__)
+
+Read = TypeVar("Read")
 
 
 class ReplayOptions(StrictModel):
@@ -97,7 +102,7 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
     return open_file
 
 
-class ReplayDriver(ThreadedDriver):
+class ReplayDriver:
     """Implements :class:`otolith_drivers.base.Driver` over a file."""
 
     def __init__(
@@ -109,8 +114,9 @@ class ReplayDriver(ThreadedDriver):
         sampling: Sampling | Mapping[str, Sampling] = Sampling.TRUE,
     ) -> None:
         """``gap`` is the time in seconds from the last row to the first one of the next repetition."""
-        super().__init__()
         self.sampling = sampling
+        self._stop = threading.Event()
+        self._played: Played | None = None
         self._open_file = open_file
         self._paced, self._repeat = options.pace == "real time", options.repeat
         self._gap = gap
@@ -126,7 +132,13 @@ class ReplayDriver(ThreadedDriver):
         except OtolithError as error:
             raise DeviceError(str(error)) from error
         self._down_reason, self._clock = "", time.monotonic()
-        self._start("replay", self._run, reader, deliver)
+        self._played = player.play(self._run(reader, deliver))
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._played is not None:
+            player.hasten(self._played)
+            self._played.ended.wait(CLOSE_TIMEOUT)
 
     def counters(self) -> Counters:
         reader = self._reader
@@ -144,54 +156,64 @@ class ReplayDriver(ThreadedDriver):
     def describe(self) -> list[str]:
         return self._description
 
-    def _run(self, reader: Reader, deliver: Deliver) -> None:
+    def _run(self, reader: Reader, deliver: Deliver) -> Playing:
         begin = self._clock
         try:
             while True:
                 self._reader = reader
                 with reader:
-                    self._play_once(reader, deliver, begin)
+                    yield from self._play_once(reader, deliver, begin)
                 if not self._repeat or self._stop.is_set():
                     break
                 begin = self._clock + self._gap
-                following = self._open_file()
+                following = yield from _result(reading.submit(self._open_file))
                 self._bad_before, self._lost_before = self._bad, self._lost_before + reader.lost
                 reader = following
             self._down_reason = "closed" if self._stop.is_set() else "the recording has ended"
         except OtolithError as error:
             self._down_reason = str(error)
-        except Exception as error:  # the thread ends: the link names the cause
+        except Exception as error:  # it is played no longer: the link names the cause
             self._down_reason = f"{type(error).__name__}: {error}"
             log.exception("the replay stopped with an error")
 
-    def _play_once(self, reader: Reader, deliver: Deliver, begin: float) -> None:
+    def _play_once(self, reader: Reader, deliver: Deliver, begin: float) -> Playing:
         """Deliver the whole file, its first row at ``begin`` (s, monotonic)."""
-        offset: float | None = None
-        for rows in prefetch(reader.chunks(), self._stop):
+        offset, chunks = None, reader.chunks()
+        following = reading.submit(next, chunks, None)
+        while (rows := (yield from _result(following))) is not None and not self._stop.is_set():
+            following = reading.submit(next, chunks, None)
             if offset is None:
                 offset = begin - float(rows.times[0])
-            self._deliver(rows, rows.times + offset, deliver)
-        if not self._stop.is_set():
+            yield from self._deliver(rows, rows.times + offset, deliver)
+        if rows is None:
             self._bad = self._bad_before + reader.bad
 
-    def _deliver(self, rows: Rows, times: Array, deliver: Deliver) -> None:
+    def _deliver(self, rows: Rows, times: Array, deliver: Deliver) -> Playing:
         """Deliver each row at its time; a row that goes back in time comes with the row above it."""
         clock = np.maximum.accumulate(np.maximum(times, self._clock))
         at = 0
         while at < len(clock) and not self._stop.is_set():
-            until = min(at + MAX_ROWS_AT_ONCE, len(clock))
+            now, until = time.monotonic(), min(at + MAX_ROWS_AT_ONCE, len(clock))
             if self._paced:
-                now = time.monotonic()
                 until = min(until, int(np.searchsorted(clock, now, side="right")))
+            if until > at:
+                samples = _samples(rows, times, slice(at, until))
+                self._received += len(samples)
+                self._bad = self._bad_before + int(rows.bad[until - 1])
+                deliver(samples)
+                self._clock, at = float(clock[until - 1]), until
+            if self._paced and at < len(clock):
                 self._clock = float(clock[at])
-                if until <= at:
-                    self._stop.wait(min(self._clock - now, MAX_WAIT))
-                    continue
-            samples = _samples(rows, times, slice(at, until))
-            self._received += len(samples)
-            self._bad = self._bad_before + int(rows.bad[until - 1])
-            deliver(samples)
-            self._clock, at = float(clock[until - 1]), until
+                yield min(max(self._clock, now + GATHERED), now + MAX_WAIT)
+            else:
+                yield now
+
+
+def _result(asked: "Future[Read]") -> Generator[float, None, Read]:
+    """Wait for what another thread reads."""
+    while not asked.done():
+        yield time.monotonic() + CHUNK_POLL
+    return asked.result()
 
 
 def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
@@ -204,15 +226,3 @@ def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
     numbered.sort(key=lambda pair: pair[0])
     return [sample for _, sample in numbered]
 
-
-def prefetch(chunks: Iterator[Rows], stop: threading.Event) -> Iterator[Rows]:
-    """``chunks``, each read in another thread while the one before is used, until ``stop`` is set."""
-    with ThreadPoolExecutor(1, "replay-read") as reading:
-        following = reading.submit(next, chunks, None)
-        while not stop.is_set():
-            if not wait([following], QUEUE_POLL).done:
-                continue
-            if (rows := following.result()) is None:
-                return
-            following = reading.submit(next, chunks, None)
-            yield rows

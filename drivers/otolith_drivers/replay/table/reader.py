@@ -43,7 +43,7 @@ from otolith_drivers.replay.table.times import Clock, TimeRequest, question_of_u
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)
 # and test_replay_tables.py (the result does not depend on it).
-CHUNK = 1 << 19  # characters read at once
+CHUNK = 1 << 17  # characters read at once
 
 LOST_BLOCK = re.compile(rb"\0{16,}")  # what a file system leaves of a block that was not written when the power failed
 
