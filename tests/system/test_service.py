@@ -139,12 +139,12 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         machine.missed += 1
         hall._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        hall._pool._compiled += 1  # a kernel is compiled: time for the next one
+        hall._pool.progress += 1  # a kernel is compiled: time for the next one
         hall._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
         hall._feed_watchdog(1000.0 + 2 * patience + 5.9)
         assert fed()
-        machine.finished += 1  # a window is finished
+        hall._pool.progress += 1  # a window is finished
         worker.is_compiling = False
         hall._feed_watchdog(1000.0 + 2 * patience + 8.0)
         assert fed()

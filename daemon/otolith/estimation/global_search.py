@@ -7,6 +7,7 @@ the assumed process noise falls in steps to that of the machine (continuation: E
 Numerical Continuation Methods, section 1.2). It fits the initial state as well.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,7 +60,7 @@ class SearchScale:
     def position(self, values: Array) -> Array:
         """Return the position (free,) of parameters within their bounds (free,)."""
         by_magnitude = self._by_magnitude()
-        low, high = np.where(by_magnitude, self.low, 1.0), np.where(by_magnitude, self.high, np.e)
+        low, high = np.where(by_magnitude, self.low, 1.0), np.where(by_magnitude, self.high, math.e)
         width = np.where(self.high > self.low, self.high - self.low, 1.0)
         logarithm = np.log(np.where(by_magnitude, values, low) / low) / np.log(high / low)
         return np.clip(np.where(by_magnitude, logarithm, (values - self.low) / width), 0.0, 1.0)

@@ -10,10 +10,12 @@ import operator
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, replace
 from functools import partial
 from numbers import Real
+from queue import SimpleQueue
 from types import FrameType, TracebackType
 from typing import Any, Self, TypeVar, cast
 from weakref import WeakSet
@@ -44,6 +46,32 @@ class _DefectError(Exception):
     """What a driver does wrong, in words."""
 
 
+class _Caller(threading.Thread):
+    """A thread that makes one call after the other; one whose call has not returned makes no further ones."""
+
+    def __init__(self) -> None:
+        super().__init__(name="call-driver", daemon=True)
+        self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self.start()
+
+    def run(self) -> None:
+        while True:
+            self._calls.get()()
+            _idle.append(self)
+
+    @classmethod
+    def make(cls, call: Callable[[], None]) -> None:
+        """Make a call, in a thread that waits for one, or in a new one."""
+        try:
+            caller = _idle.pop()
+        except IndexError:
+            caller = cls()
+        caller._calls.put(call)
+
+
+_idle: deque[_Caller] = deque()  # A hall makes hundreds of calls a second
+
+
 class _Call:
     """Calls one method of a driver, never twice at a time."""
 
@@ -51,6 +79,7 @@ class _Call:
         """``title`` names the method in a defect."""
         self._title = title
         self._begun: float | None = None  # s; None if no call is under way
+        self._returned = threading.Event()
         self._outcome: tuple[Any, Exception | None] | None = None
 
     def run(self, method: Callable[[], Any], timeout: float) -> Any:
@@ -63,9 +92,9 @@ class _Call:
         """
         if self._begun is None:
             self._begun, self._outcome = time.monotonic(), None
-            thread = threading.Thread(target=self._run, args=(method,), name="call-driver", daemon=True)
-            thread.start()
-            thread.join(timeout)
+            self._returned.clear()
+            _Caller.make(partial(self._run, method))
+            self._returned.wait(timeout)
         if self._outcome is None:
             if (waited := time.monotonic() - self._begun) > STUCK:
                 raise _DefectError(f"{self._title} has not returned for {waited:.0f} s")
@@ -83,6 +112,7 @@ class _Call:
             self._outcome = None, error
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything, also SystemExit
             self._outcome = None, _DefectError(f"{self._title} raises {_named(error)}")
+        self._returned.set()
 
 
 class GuardedSource:

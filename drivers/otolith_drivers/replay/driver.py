@@ -225,4 +225,3 @@ def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
         numbered += [(row, Sample(name, moment, value)) for row, moment, value in readings]
     numbered.sort(key=lambda pair: pair[0])
     return [sample for _, sample in numbered]
-

@@ -14,8 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 log = logging.getLogger(__name__)
 
-READERS = 2  # threads that read chunks of files; engineering choice: one that waits for a disk leaves the other
-IDLE = 1.0  # s; engineering choice: how long the thread stays when nothing is played
+# Engineering choices: docs/reference/thresholds-replay.md.
+READERS = 2  # threads that read chunks of files: one that waits for a disk leaves the other
+IDLE = 1.0  # s for which the thread stays when nothing is played
 
 Playing = Iterator[float]
 """Does what is due at each step and yields when the next one is, s, monotonic."""
@@ -54,8 +55,7 @@ class _Player:
     def hasten(self, played: Played) -> None:
         """Step a recording at once: something has changed for it."""
         with self._changed:
-            rows = [(0.0 if row[2] is played else row[0], *row[1:]) for row in self._due]
-            self._due[:] = rows
+            self._due = [(0.0 if row[2] is played else row[0], *row[1:]) for row in self._due]
             heapq.heapify(self._due)
             self._changed.notify()
 

@@ -175,3 +175,32 @@ def test_replay_without_usable_rows_brings_the_link_down(tmp_path: Path) -> None
     wait_for(lambda: not driver.link().up)
     assert "none of the 1 rows can be used" in driver.link().reason
     driver.close()
+
+
+def test_all_recordings_of_a_process_share_a_thread(tmp_path: Path) -> None:
+    """A hall replays hundreds of them. Each gets all its rows, and closing one leaves the others."""
+    path, before = written_table(tmp_path, 60), set(threading.enumerate())
+    drivers = [driver_of(path) for _ in range(20)]
+    got: list[list[Sample]] = [[] for _ in drivers]
+    for driver, samples in zip(drivers, got, strict=True):
+        driver.open(samples.extend)
+    playing = [own for own in set(threading.enumerate()) - before if own.name == "replay"]
+    drivers[0].close()
+    assert len(playing) <= 1
+    wait_for(lambda: not any(driver.link().up for driver in drivers))
+    assert all(driver.link().reason == ENDED for driver in drivers[1:])
+    assert {len(samples) for samples in got[1:]} == {drivers[1].counters().received} == {118}
+
+
+def test_a_receiver_that_raises_ends_no_other_recording(tmp_path: Path) -> None:
+    def refusing(_: object) -> None:
+        raise ValueError("full")
+
+    path, got = written_table(tmp_path, 60), list[Sample]()
+    wrong, right = driver_of(path), driver_of(path)
+    wrong.open(refusing)
+    right.open(got.extend)
+    wait_for(lambda: not right.link().up)
+    assert right.link().reason == ENDED
+    assert len(got) == 118
+    assert "full" in wrong.link().reason

@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 RECORDER_INTERVAL = 0.1  # s between two looks at the recorder
+WATCHDOG_INTERVAL = 0.1  # s between two looks whether windows are being finished
 STATUS_INTERVAL = 2.0  # s between two lines for systemd about a hall
 STORAGE_FLUSH, STORAGE_FLUSH_OF_MACHINE = 1.5, 0.03  # s to finish writing at the end of a hall, and for each machine
 
@@ -58,7 +59,7 @@ class Daemon:
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
         self._is_reload_due = False
-        self._fed_at = self._recorders_at = self._status_at = 0.0
+        self._fed_at = self._watchdog_at = self._recorders_at = self._status_at = 0.0
 
     def run(self) -> int:
         """Serve until SIGTERM or SIGINT, or in a terminal SIGHUP, and return the number of that signal.
@@ -192,7 +193,9 @@ class Daemon:
                 self._show_status(line, time.monotonic())
         now = time.monotonic()
         self._show_preparation()
-        self._feed_watchdog(now)
+        if now - self._watchdog_at >= WATCHDOG_INTERVAL:
+            self._watchdog_at = now
+            self._feed_watchdog(now)
         if now - self._recorders_at >= RECORDER_INTERVAL or self._is_alone:
             self._recorders_at = now
             for service in self._served:

@@ -111,13 +111,9 @@ class Pool:
         names = (f"otolith-worker{f'-{number}' if count > 1 else ''}" for number in range(1, count + 1))
         self.workers = tuple(Worker(name) for name in names)
         self._queue: deque[Machine] = deque()  # With a window that waits, in the order of their turns
-        self._compiled = 0  # Kernels
-        self._seen = 0  # Progress at the last look of the watchdog
-
-    @property
-    def progress(self) -> int:
+        self.progress = 0
         """Finished windows and compiled kernels."""
-        return self._compiled + sum(machine.finished for machine in self._machines)
+        self._seen = 0  # Progress at the last look of the watchdog
 
     @property
     def restarts(self) -> int:
@@ -200,6 +196,7 @@ class Pool:
                 finished = machine.accept(reply)
                 self._enqueue(machine)
                 if finished is not None:
+                    self.progress += 1
                     yield Computed(machine, finished)
 
     def _note(self, worker: Worker, step: kernel_cache.CompileStep | Ready, now: float) -> None:
@@ -208,7 +205,7 @@ class Pool:
             worker.is_ready = True
         elif step.is_end:
             worker.prepared += [step.compiled] if step.is_kernel and not worker.is_ready else []
-            self._compiled += step.compiled
+            self.progress += step.compiled
             number = None if worker.is_ready else self.preparation
             count = f", {number.done} of {number.total}" if step.is_kernel and number is not None else ""
             log.log(logging.INFO if step.compiled else logging.DEBUG, "compiled %s%s", step.kernel, count)
