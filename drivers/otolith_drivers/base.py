@@ -60,7 +60,7 @@ class Sampling(StrEnum):
     """Meaning of the times of a driver's samples, which decides how samples become records of a window."""
 
     CYCLIC = "cyclic"  # The source samples on its own grid; a time is one of arrival: maybe late, never early
-    TRUE = "true"  # A time is when the value was true, and is used as it is. A command changes at its samples
+    TRUE = "true"  # A time is that of measurement, and is used as it is. A command changes at its samples
     POLLED = "polled"  # As TRUE, but asked by a clock of its own: a command may have changed since
 
 

@@ -101,8 +101,14 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
             "i ist ab t = 4 s bei 3 A begrenzt: 20 von 100 Datensätzen zählen nicht; Messbereich des Sensors prüfen",
         ),
         (
-            "if these readings are right, write checks = [] under i in [signals]; 3 records are too few",
-            "wenn diese Messwerte stimmen, checks = [] unter i in [signals] eintragen; 3 Datensätze sind zu wenig",
+            (
+                "if these readings are right, write checks = [] under i in [signals]; "
+                "3 records are fewer than 5, which a window needs"
+            ),
+            (
+                "wenn diese Messwerte stimmen, checks = [] unter i in [signals] eintragen; "
+                "3 Datensätze sind weniger als 5, die ein Zeitfenster braucht"
+            ),
         ),
         (
             "a step of V_a from 3 to 5 V would decide if the other inputs stay as they are",

@@ -226,7 +226,7 @@ def _decide_and_update(scores: _Scores) -> WindowResult:
     - No test is open, and the window shows nothing that the twin lacks: the filter is updated. Parameters that this
       window and those before show to have moved are estimated anew.
     - The window opens a test although it is expected, and the null hypothesis is possible: the filter is updated.
-    - The window shows nothing of what opened the test: the filter is updated beside it.
+    - The window shows nothing of what opened the test: the filter is updated; the test stays open.
     - Otherwise the decision of the test is applied.
     """
     state, tested, test, moved = scores.state, scores.tested, scores.test, scores.ledger.cusum.moved

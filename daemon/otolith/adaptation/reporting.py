@@ -100,8 +100,7 @@ class WindowResult:
     adopted: tuple[AdoptedComponent, ...]
     estimate: WindowEstimate | None = None  # None for a window that was not estimated from
     test: SequentialTest | None = None
-    """The sequential test that is open, or that this window decided; with an updated filter, one that may still close.
-    """
+    """The sequential test that is open, or that this window decided. If the filter was updated, it may still close."""
     reason: str = ""  # Why the window was not estimated from
     faulty_sensors: tuple[FaultySensor, ...] = ()  # Those whose samples made it unusable
     notes: tuple[str, ...] = ()  # What the data checks left out

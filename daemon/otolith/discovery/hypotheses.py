@@ -177,7 +177,7 @@ def largest_chi_square(least: float, count: float) -> float:
 
 
 def evidence_factor(fitted: Iterable[FittedHypothesis]) -> float:
-    """Return by what the evidence of a search is divided, at least one: what even the best hypothesis leaves.
+    """Return the factor, at least one, by which the evidence of a search is discounted: what the best one leaves.
 
     What exceeds the noise is correlated, and its samples are no independent evidence: its long-run variance counts.
     """

@@ -127,7 +127,7 @@ def _channels(problem: Problem, check: Check) -> frozenset[str]:
 
 def _unusable_values(window: Window) -> tuple[str, ...]:
     if window.records < MIN_RECORDS:
-        return (f"{window.records} records are too few",)
+        return (f"{window.records} records are fewer than {MIN_RECORDS}, which a window needs",)
     if not (np.abs(window.values) < MAX_VALUE).all():  # also false for not-a-number
         return (f"a value is not finite or beyond {MAX_VALUE:g}",)
     return ()

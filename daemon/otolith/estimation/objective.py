@@ -353,7 +353,7 @@ def _plausible_step(values: Array, noise: float) -> float:
 def adc_step(values: Array) -> float:
     """Return the step of the converter behind ``values`` (n,), or 0 if the values show none.
 
-    Fewer than ``MIN_ADC_LEVELS`` show it if a level comes again: a sensor that fails jumps to another level once.
+    Two visits to the same level also indicate a converter: a failing sensor changes its level once.
     """
     ordered = np.sort(values)
     rises = ordered[1:] != ordered[:-1]

@@ -490,7 +490,7 @@ def _raised(
 def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence) -> tuple[Level, int]:
     """Return the level after the ``recent`` observations, and how many windows ago the first of them began that agree.
 
-    A condition that comes and goes is not over before all of ``within`` windows are without it.
+    A condition that comes and goes ends after ``within`` consecutive windows without it.
     """
     rise, fall = persistence.rise, persistence.fall
     among = recent[-max(rise, persistence.within) :]
