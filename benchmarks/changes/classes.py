@@ -148,7 +148,7 @@ def _speed() -> list[Trial]:
 
 def _brushes() -> list[Trial]:
     pair, free = "brush drop / offset of V_a", ("R_a", "D")
-    offset_member = Member("SENSOR", r"^V_a reads .* V off")
+    offset_member = Member("SENSOR", r"^V_a reads wrong by .* V")
     members = (Member("COMPONENT", "^winding(:|/constant|/Coulomb)"), offset_member)
     drop = Change(terms={"winding": Term("Coulomb", "i", -0.6, 0.02)})
     offset = Change(offsets={"V_a": 0.6})

@@ -43,7 +43,7 @@ def test_a_wrong_scale_is_named_from_any_record_on(first: int) -> None:
 
     documents = reports(motor_problem(*FREE), changed(change, 3))
     assert all(document.decision is WindowDecision.SENSOR for document in documents[BEGIN + 3 :])
-    assert "omega reads +5.0% off" in documents[-1].findings[0].text
+    assert "omega reads wrong by +5.0%" in documents[-1].findings[0].text
     assert_estimates_hold(documents[-1])
 
 

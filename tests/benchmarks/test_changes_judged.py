@@ -28,8 +28,8 @@ def stated(**probabilities: float) -> list[Stated]:
     texts = {
         "k_v": Stated("PARAMETER", "h_0, k_v", 0.0),
         "h_0": Stated("PARAMETER", "h_0", 0.0),
-        "u": Stated("SENSOR", "u reads +9.5% off", 0.0),
-        "T_m": Stated("SENSOR", "T_m reads +9.5% off", 0.0),
+        "u": Stated("SENSOR", "u reads wrong by +9.5%", 0.0),
+        "T_m": Stated("SENSOR", "T_m reads wrong by +9.5%", 0.0),
         "head": Stated("COMPONENT", "head: -0.12", 0.0),
     }
     return [replace(texts[name], probability=share) for name, share in probabilities.items()]
@@ -174,8 +174,8 @@ def test_the_most_probable_hypotheses_are_counted_by_kind_and_decision() -> None
         ("parameter", "J", Stated("PARAMETER", "J", 1.0), Stated("PARAMETER", "J_m", 1.0)),
         ("component", "shaft", Stated("COMPONENT", "shaft: 1", 1.0), Stated("COMPONENT", "winding: 1", 1.0)),
         ("component", "shaft", Stated("COMPONENT", "shaft/linear/i", 1.0), Stated("SENSOR", "shaft: 1", 1.0)),
-        ("gain", "i", Stated("SENSOR", "i reads +9% off", 1.0), Stated("SENSOR", "omega reads +9% off", 1.0)),
-        ("offset", "i", Stated("SENSOR", "i reads +1 A off", 1.0), Stated("PARAMETER", "i", 1.0)),
+        ("gain", "i", Stated("SENSOR", "i reads wrong by +9%", 1.0), Stated("SENSOR", "omega reads wrong by +9%", 1.0)),
+        ("offset", "i", Stated("SENSOR", "i reads wrong by +1 A", 1.0), Stated("PARAMETER", "i", 1.0)),
         ("nothing", "", Stated("NOTHING", "nothing", 1.0), Stated("PARAMETER", "J", 1.0)),
     ],
 )

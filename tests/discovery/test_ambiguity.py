@@ -35,7 +35,7 @@ def test_a_sensor_and_several_moved_parameters_that_explain_the_same_are_equally
 
 
 def test_fewer_values_do_not_decide_against_a_better_fit() -> None:
-    """Seen on a motor without a current sensor: "omega reads +15 % off" although K, J and T_c had moved."""
+    """Seen on a motor without a current sensor: "omega reads wrong by +15 %" although K, J and T_c had moved."""
     moved, sensor = stated(FaultType.PARAMETER, 4.0, 0.0, 3), stated(FaultType.SENSOR, 0.0, 11.0, 1, OFFSET)
     assert shares_of([sensor, moved, NULL]) == pytest.approx([0.5, 0.5, 0.0], abs=1e-6)
 

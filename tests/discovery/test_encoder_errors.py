@@ -40,7 +40,7 @@ def test_a_moving_axis_shows_that_its_encoder_is_wrong(seed: int) -> None:
     assert not any(document.components for document in documents)
     assert documents[-1].decision is WindowDecision.SENSOR
     (finding,) = (item for item in documents[-1].findings if item.subject == "x")
-    size, _, inner = finding.text.removeprefix("x reads ").partition("·sin(")
+    size, _, inner = finding.text.removeprefix("x reads wrong by ").partition("·sin(")
     assert float(size) == pytest.approx(6e-6, rel=0.2)
     assert 2.0 * np.pi / float(inner.partition("·")[0]) == pytest.approx(PITCH, rel=5e-3)
 

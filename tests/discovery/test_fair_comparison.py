@@ -88,8 +88,8 @@ def test_a_simple_cause_is_compared_beside_a_shape_that_fits_the_error_of_the_li
     """Force reads 10 % too much, 9.1 % of the reading: that is stated beside the parameters that it resembles."""
     case = Case("gain of F", SERVO_AXIS, Change(gains={"F": 1.1}), healthy=5, changed=2)
     (windows,) = observe(case, [0], 1)
-    stated = [(item.reason, item.text.split(" off")[0], item.probability) for item in windows[-1].stated]
-    assert any(reason == "SENSOR" and text == "F reads +9.1%" for reason, text, _ in stated), stated
+    stated = [(item.reason, item.text.split(":")[0], item.probability) for item in windows[-1].stated]
+    assert any(reason == "SENSOR" and text == "F reads wrong by +9.1%" for reason, text, _ in stated), stated
     assert max(share for reason, _, share in stated if reason == "SENSOR") == pytest.approx(stated[0][2], abs=0.01)
 
 

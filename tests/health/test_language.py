@@ -89,7 +89,7 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
     ("english", "german"),
     [
         (
-            "a sensor is wrong: V reads -0.3% off: look at the sensor and its scale (>99%); or K (1%)",
+            "a sensor is wrong: V reads wrong by -0.3%: check the sensor and its scale (>99%); or K (1%)",
             "ein Sensor misst falsch: V zeigt um -0.3% falsch an: Sensor und Skalierung prüfen (>99 %); oder K (1 %)",
         ),
         (

@@ -123,7 +123,7 @@ def _states_sensor_error(tracked: TrackedHypothesis) -> str:
         off = equation_text(equation(twin, component, values))
     else:
         off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {unit_text(site.unit)}".rstrip()
-    return f"{site.into} reads {off} off: look at the sensor and its scale"
+    return f"{site.into} reads wrong by {off}: check the sensor and its scale"
 
 
 def _states_delay(tracked: TrackedHypothesis) -> str:
