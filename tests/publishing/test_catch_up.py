@@ -236,6 +236,7 @@ def test_queries_select_by_time_and_number(tmp_path: Path) -> None:
         assert len(asked(f"{key}?_time=[..]")) == MAX_REPLIES
         assert asked(f"{key}?after={10**17};_time=[..]") == []
         assert len(asked(f"{key}?_time=[..];limit=3")) == 3
+        assert asked(f"{key}?_time=[..];last=3") == recent[-3:]
         events = client.get(f"{EVENT.under(SITE, MACHINE)}?_time=[..]", timeout=PATIENCE)
         assert len([reply for reply in events if reply.ok]) == 12
         for wrong in (
@@ -244,6 +245,7 @@ def test_queries_select_by_time_and_number(tmp_path: Path) -> None:
             "after=-1",
             "after=x",
             "after=0;limit=-1",
+            "last=-1",
             f"after={'9' * 40}",
         ):
             (reply,) = client.get(f"{key}?{wrong}", timeout=PATIENCE)

@@ -130,7 +130,7 @@ def test_a_window_of_years_keeps_nobody_from_being_silent() -> None:
 
 def test_an_answer_about_the_past_is_as_old_as_its_window() -> None:
     knowledge = Knowledge()
-    machine = knowledge.take(*sent(report_of()), START + 3600.0, is_past=True)
+    machine = knowledge.take(*sent(report_of()), START + 3600.0, answered=START + 3600.0)
     assert machine is not None
     assert machine.is_silent(START + 3600.0)
 
@@ -138,7 +138,7 @@ def test_an_answer_about_the_past_is_as_old_as_its_window() -> None:
 def test_an_answer_replaces_no_later_report() -> None:
     knowledge = Knowledge()
     take(knowledge, report_of(number=5, end=START + 10.0, state=Level.ACT))
-    knowledge.take(*sent(report_of(number=3)), START + 11.0, is_past=True)
+    knowledge.take(*sent(report_of(number=3)), START + 11.0, answered=START + 11.0)
     assert only(knowledge).state(START + 11.0) is Level.ACT
 
 

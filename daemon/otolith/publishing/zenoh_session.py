@@ -44,20 +44,21 @@ class Selection:
     after: int = 0
     start: float | None = None  # Unix s, as end; None for no bound
     end: float | None = None
-    limit: int = MAX_REPLIES  # Documents, the first ones
+    limit: int = MAX_REPLIES  # Documents, the first ones; below zero the last ones
 
 
 def selection(parameters: zenoh.Parameters, now: float) -> Selection | None:
     """Return what the parameters of a query select, None for nothing; raise ValueError if they are malformed."""
-    span, after, limit = (parameters.get(name) for name in ("_time", "after", "limit"))
-    if span is None and after is None:
+    span, after, limit, last = (parameters.get(name) for name in ("_time", "after", "limit", "last"))
+    if span is None and after is None and last is None:
         return None
     start, end = (None, None) if span is None else time_range(span, now)
-    for name, text in (("after", after), ("limit", limit)):
+    for name, text in (("after", after), ("limit", limit), ("last", last)):
         if text is not None and not re.fullmatch(r"[0-9]{1,18}", text):
             what = "a sequence number" if name == "after" else f"a number of documents, at most {MAX_REPLIES}"
             raise ValueError(f"{name}={text}: write {what}")
-    return Selection(int(after or 0), start, end, min(int(limit or MAX_REPLIES), MAX_REPLIES))
+    count = min(int(last or limit or MAX_REPLIES), MAX_REPLIES)
+    return Selection(int(after or 0), start, end, count if last is None else -count)
 
 
 def time_range(text: str, now: float) -> tuple[float | None, float | None]:
@@ -92,7 +93,10 @@ class Archive(Protocol):
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
     ) -> list[str]:
-        """Return the first ``limit`` documents of a kind with a number above ``after`` from ``start`` to ``end``."""
+        """Return documents of a kind with a number above ``after`` from ``start`` to ``end``, the oldest first.
+
+        A ``limit`` is of the first ones; one below zero is of the last ones.
+        """
 
 
 def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: Archive | None) -> None:

@@ -162,7 +162,7 @@ class SitePages:
 
     def _shown(self, language: Language) -> Shown:
         with self._collector.lock:
-            return self._hall.shown(time.time(), language)
+            return self._hall.shown(time.monotonic(), language)
 
     async def _show_hall(self, request: Request) -> Response:
         language, chosen = self._language(request), _filter(request)
@@ -172,10 +172,10 @@ class SitePages:
         return Pieces(hall.page(chosen, own, self._frame(language)), HTML)
 
     def _compared(self, language: Language) -> list[bytes]:
-        knowledge, zone, now = self._collector.knowledge, self._settings.timezone, time.time()
+        knowledge, zone, now = self._collector.knowledge, self._settings.timezone, time.monotonic()
         with self._collector.lock:
             own = {"peers": peers(knowledge, now, language), "poor": poor_data(knowledge, now, language, zone),
-                   "events": week(knowledge, now, language, zone)}  # fmt: skip
+                   "events": week(knowledge, time.time(), language, zone)}  # fmt: skip
             refused = {reason.value: count for reason, count in knowledge.refused.items()}
         page = PAGES.get_template("compare.html").render(
             own, first=FIRST_PEERS, here="compare", language=language, refused=refused, **self._frame(language)
@@ -218,7 +218,7 @@ class SitePages:
 
     def _exposition(self) -> list[bytes]:
         with self._collector.lock:
-            return [self._scrape.exposition(self._collector.dropped, self._outlets, time.time())]
+            return [self._scrape.exposition(self._collector.dropped, self._outlets, time.monotonic())]
 
     async def _show_metrics(self, _: Request) -> Response:
         return Pieces(await self._metrics.get(), CONTENT_TYPE)

@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 MAX_WAITING = 4000  # documents
 MAX_QUERIES = 8  # at a time
 MAX_ANSWER_BYTES = 8 << 20  # of the documents of one query
-PAUSE = 1.0  # s without a document after which daemons are asked for what was dropped
+PAUSE = 1.0  # s between two looks whether daemons can be asked for what was dropped
+PAST_CHANGES = 500  # changes of events that are asked for, the last ones
 PAST = "-7d"  # of the events that are asked for
 
 
@@ -84,12 +85,14 @@ class Collector:
                 self._behind.add(arrival.machine)
 
     def _run(self) -> None:
+        due = 0.0
         while not self._stopping.is_set():
+            if self._behind and time.monotonic() >= due:
+                due = time.monotonic() + PAUSE
+                self._look_back_if_there_is_room()
             try:
                 arrival, is_past = self._waiting.get(timeout=PAUSE)
             except queue.Empty:
-                while self._behind:
-                    self._look_back(self._behind.pop())
                 continue
             try:
                 self._take(arrival, is_past=is_past)
@@ -97,16 +100,21 @@ class Collector:
                 log.exception("%s: not taken", arrival.key)
 
     def _take(self, arrival: Arrival, *, is_past: bool) -> None:
-        now = time.time()
+        now, answered = time.monotonic(), time.time() if is_past else None
         with self.lock:
             if arrival.content is None:
                 machine = self.knowledge.take_alive(arrival.key, now, is_alive=arrival.is_alive)
             else:
-                machine = self.knowledge.take(arrival.key, arrival.content, now, is_past=is_past)
+                machine = self.knowledge.take(arrival.key, arrival.content, now, answered=answered)
             if machine is None or (machine.is_asked and arrival.content is not None) or not arrival.is_alive:
                 return
             machine.is_asked = True
         self._look_back(arrival.machine)
+
+    def _look_back_if_there_is_room(self) -> None:
+        """Ask daemons for what was dropped, unless the answers would be dropped, too."""
+        while self._behind and self._waiting.qsize() < MAX_WAITING // 2:
+            self._look_back(self._behind.pop())
 
     def _look_back(self, machine: str) -> None:
         """Ask a daemon for its latest report and its last events, unless it is being asked."""
@@ -118,7 +126,8 @@ class Collector:
             self._queries.submit(self._query, machine)
 
     def _query(self, machine: str) -> None:
-        selectors = {f"{machine}/{EVENT.key}?_time=[now({PAST})..now()]": MAX_REPLIES, f"{machine}/{REPORT.key}": 1}
+        changes = f"{machine}/{EVENT.key}?_time=[now({PAST})..now()];last={PAST_CHANGES}"
+        selectors = {changes: MAX_REPLIES, f"{machine}/{REPORT.key}": 1}
         try:
             for selector, limit in selectors.items():
                 for key, content in self._sessions.get(selector, limit, MAX_ANSWER_BYTES):

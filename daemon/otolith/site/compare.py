@@ -124,7 +124,7 @@ def _outliers(shares: list[float], reaches: list[float]) -> list[bool]:
 
 
 def week(knowledge: Knowledge, now: float, language: Language, zone: str | None) -> list[TimedEvent]:
-    """Return the events that were open in the last week, the newest first; without hints."""
+    """Return the events that were open in the week before ``now``, Unix s, the newest first; without hints."""
     found = sorted(_recent(knowledge, now), key=lambda row: -row[0])
     return [event for _, event in _worded(found[:MAX_ROWS], language, zone)]
 

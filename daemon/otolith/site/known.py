@@ -1,8 +1,9 @@
 """What is known of each machine of a site, from the documents that its daemons publish.
 
-It has no clock: each call says what time it is, in Unix s of the computer of the site. Anybody may publish anything to
-a router without access control, so a document counts only if it can be read, is not too large, and is of the machine
-that its key names. Invented machines take the place of other invented ones, not of those that report for longer.
+It has no clock: each call says what time it is, in s of a clock that only elapses, so that setting the wall clock makes
+nobody silent. Anybody may publish anything to a router without access control, so a document counts only if it can be
+read, is not too large, and is of the machine that its key names. Invented machines take the place of other invented
+ones, not of those that report for longer.
 """
 
 from array import array
@@ -167,10 +168,10 @@ class Knowledge:
 
         return sorted(self, key=order)
 
-    def take(self, key: str, content: bytes, now: float, *, is_past: bool = False) -> KnownMachine | None:
-        """Take a document that came under a key; ``is_past`` of an answer, which may have been published long before.
+    def take(self, key: str, content: bytes, now: float, *, answered: float | None = None) -> KnownMachine | None:
+        """Take a document that came under a key, and return its machine if it was taken, or had been before.
 
-        Return its machine if it was taken, or had been before.
+        ``answered`` is the Unix time at which an answer came, which may have been published long before.
         """
         if (identity := _identity(key)) is None:
             return None
@@ -179,7 +180,7 @@ class Knowledge:
         if len(content) <= MAX_BYTES:
             try:
                 if topic == REPORT.key:
-                    taken = self._take_report(site, name, content, now, is_past=is_past)
+                    taken = self._take_report(site, name, content, now, answered)
                 else:
                     taken = self._take_event(site, name, content, now)
             except ValueError:  # ValidationError and UnicodeDecodeError are ValueErrors
@@ -233,7 +234,7 @@ class Knowledge:
         return True
 
     def _take_report(
-        self, site: str, name: str, content: bytes, now: float, *, is_past: bool
+        self, site: str, name: str, content: bytes, now: float, answered: float | None
     ) -> KnownMachine | RefusedFor:
         text = content.decode().replace('"schema"', '"schema_"', 1)
         report = ReportDocument.model_validate_json(text, extra="ignore")  # a later version may write more
@@ -241,7 +242,8 @@ class Knowledge:
             return RefusedFor.OTHER_NAME
         if any(len(event.id) > MAX_EVENT_ID for event in report.events):
             return RefusedFor.TOO_LARGE
-        known, heard = self.get(site, name), min(now, report.window.end) if is_past else now
+        known, is_past = self.get(site, name), answered is not None
+        heard = now if answered is None else now - max(answered - report.window.end, 0.0)
         if known is not None and (step := _step(known, report)) is not None and step <= 0:
             if step == 0 or is_past:
                 return known

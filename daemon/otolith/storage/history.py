@@ -438,9 +438,10 @@ class HistoryReader:
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
     ) -> list[str]:
-        """Return the first ``limit`` documents of a ``kind``, ``report`` or ``event``, with the labels that hold now.
+        """Return documents of a ``kind``, ``report`` or ``event``, the oldest first, with the labels that hold now.
 
-        They have a sequence number above ``after``, and their windows end from ``start`` to ``end``.
+        They have a sequence number above ``after``, and their windows end from ``start`` to ``end``. A ``limit`` is of
+        the first ones; one below zero is of the last ones.
         """
         table, labels, unpacked = "event" if kind == "event" else "report", self.labels(), Unpacker()
         begin = -math.inf if start is None else labels.first(start)
@@ -450,8 +451,9 @@ class HistoryReader:
         lower = "?1" if start is None else f"max(?1, (SELECT min(+sequence) {numbers}) - 1)"
         upper = "" if end is None else f"AND sequence <= (SELECT max(+sequence) {numbers})"
         among = f"sequence > {lower} {upper} AND +time BETWEEN ?2 AND ?3"
-        query = f"SELECT text FROM {table} WHERE {among} ORDER BY sequence LIMIT ?4"  # noqa: S608 - as above
-        rows = self._rows(query, after, begin, until, limit)
+        order = "DESC" if limit < 0 else "ASC"
+        query = f"SELECT text FROM {table} WHERE {among} ORDER BY sequence {order} LIMIT ?4"  # noqa: S608 - as above
+        rows = self._rows(query, after, begin, until, abs(limit))[:: -1 if limit < 0 else 1]
 
         def published(row: bytes | str) -> str:
             text = unpacked(row)

@@ -22,7 +22,7 @@ from otolith.site.known import Knowledge
 from otolith.site.outlets import mail
 from otolith.site.outlets import notices as notices_module
 from otolith.site.outlets.base import Notice, OutletError, OutletSetup, Told
-from otolith.site.outlets.notices import HOUR, MISSED, Notices, RateLimit
+from otolith.site.outlets.notices import HOUR, LASTING, MISSED, Notices, RateLimit, Silences
 from otolith.site.outlets.options import MailOutlet, WebhookOutlet
 from otolith.site.outlets.webhook import build as webhook
 from tests.hostile import hostile_text
@@ -47,8 +47,8 @@ def test_a_change_of_state_is_told_and_nothing_else(states: list[Level | None]) 
         now = START + 2.0 * index
         event = raised(state or Level.ACT, START).model_copy(update={"since": now, "end": None if state else now})
         knowledge.take(*sent(report_of(number=index + 1, end=now, events=(event,))), now)
-        told += [each.told for each in notices.take(knowledge)]
-        assert notices.take(knowledge) == []
+        told += [each.told for each in notices.take(knowledge, now)]
+        assert notices.take(knowledge, now) == []
     steps = [None, *states]
     expected = sum(before is not after for before, after in zip(steps, states, strict=False))
     assert len(told) == expected
@@ -61,7 +61,48 @@ def test_what_changed_shortly_before_the_start_is_told(age: float, count: int) -
     knowledge = Knowledge()
     event = raised(time=START).model_copy(update={"since": START - age})
     knowledge.take(*sent(report_of(events=(event,))), START)
-    assert len(Notices(START).take(knowledge)) == count
+    assert len(Notices(START).take(knowledge, START)) == count
+
+
+@pytest.mark.parametrize("jump", [-864_000.0, 864_000.0])
+def test_an_event_is_told_whatever_the_wall_clock_of_the_site_said_at_its_start(jump: float) -> None:
+    """The clock of the site is not that of the daemon, and may have been set since."""
+    knowledge, notices = Knowledge(), Notices(START + jump)
+    knowledge.take(*sent(report_of(events=(raised(time=START),))), START + jump)
+    assert [each.told for each in notices.take(knowledge, START + jump)] == [Told.RAISED]
+
+
+def silences(silent: Silences, knowledge: Knowledge, now: float) -> list[tuple[str, Told]]:
+    return [(each.machine, each.told) for each in silent.take(knowledge, now, now, "en")]
+
+
+def test_silence_and_its_end_are_told_once_each_when_they_last() -> None:
+    knowledge, silent, told, count = Knowledge(), Silences(), list[tuple[float, Told]](), 0
+    for index in range(1000):
+        now, second = START + index, float(index)
+        if second % 2 == 0 and not (200 <= second < 230 or 400 <= second < 600 or 650 <= second < 690):
+            count += 1
+            knowledge.take(*sent(report_of(number=count, end=now)), now)
+        told += [(second, each) for _, each in silences(silent, knowledge, now)]
+    (first, raising), (second, clearing) = told
+    assert (raising, clearing) == (Told.RAISED, Told.CLEARED)
+    assert 400 + LASTING <= first <= 400 + LASTING + 15
+    assert 600 + LASTING <= second <= 600 + LASTING + 100
+
+
+def test_a_machine_that_was_named_and_never_reports_is_told_and_one_that_is_forgotten_is_not() -> None:
+    knowledge, silent = Knowledge(["hall-1/press-3"]), Silences()
+    assert silences(silent, knowledge, START) == []
+    assert silences(silent, knowledge, START + LASTING) == [("press-3", Told.RAISED)]
+    assert silences(silent, Knowledge(), START + LASTING) == silences(silent, Knowledge(), START + 2 * LASTING) == []
+
+
+def test_a_link_that_is_cut_leaves_room_for_what_machines_report() -> None:
+    limit = RateLimit(10)
+    own = [notice(str(index), Level.NO_DATA) for index in range(200)]
+    assert len(limit.passes(own, START)) == 5
+    assert len(limit.passes([notice(str(index)) for index in range(10)], START + 1.0)) == 5
+    assert limit.withheld == 200
 
 
 def test_an_event_that_is_open_is_told_once_however_many_others_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +113,7 @@ def test_an_event_that_is_open_is_told_once_however_many_others_there_are(monkey
         now = START + 1.0 + index
         other = raised(time=now).model_copy(update={"id": f"other@{index}", "start": now, "end": None})
         knowledge.take(*sent(report_of(number=index + 1, end=now, events=(first, other))), now)
-        told += [each.event.id for each in notices.take(knowledge) if each.told is Told.RAISED]
+        told += [each.event.id for each in notices.take(knowledge, now) if each.told is Told.RAISED]
     assert len(told) == len(set(told)) == 201
     assert len(notices._told) <= 60
 

@@ -53,7 +53,7 @@ class MachineView:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """That an event was raised, has changed its state or was cleared."""
+    """That an event was raised, has changed its state or was cleared, or that a machine is silent or heard again."""
 
     site: str
     machine: str

@@ -12,7 +12,7 @@ from otolith.site.cards import card_of
 from otolith.site.collector import Collector
 from otolith.site.known import KnownMachine
 from otolith.site.outlets.base import MachineView, Notice, Outlet, OutletError, OutletSetup
-from otolith.site.outlets.notices import Notices, RateLimit
+from otolith.site.outlets.notices import Notices, RateLimit, Silences
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,8 @@ class OutletRunner:
         """``per_hour`` bounds its notices; their texts are in language and zone of ``setup``."""
         self.status = OutletStatus(name)
         self._outlet, self._collector, self._setup = outlet, collector, setup
-        self._notices, self._limit = Notices(time.time()), RateLimit(per_hour)
+        self._notices, self._silences = Notices(time.monotonic()), Silences()
+        self._limit = RateLimit(per_hour)
         self._pending: deque[Notice] = deque()
         self._dropped = 0
         self._shown: dict[str, tuple[object, ...]] = {}  # Revision of each machine that was passed on
@@ -89,10 +90,11 @@ class OutletRunner:
 
     def _pass_on(self) -> bool:
         """Pass on what has changed; return whether the other side was reached."""
-        now = time.time()
+        now, language = time.monotonic(), self._setup.language or "en"
         with self._collector.lock:
             machines = list(self._collector.knowledge)
-            new = [self._reworded(notice) for notice in self._notices.take(machines)]
+            new = [self._reworded(notice) for notice in self._notices.take(machines, now)]
+            new += self._silences.take(machines, now, time.time(), language)
             changed = [view for machine in machines if (view := self._view(machine, now)) is not None]
         self._pending.extend(self._limit.passes(new, now))
         while len(self._pending) > MAX_PENDING:
