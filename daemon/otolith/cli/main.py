@@ -25,7 +25,6 @@ from otolith.cli.commissioning.probe import probe
 from otolith.cli.commissioning.twin import twin
 from otolith.cli.common import (
     ANY_DATA_FILES,
-    DATA_FILES,
     FILE,
     INTERRUPTED,
     MACHINE_FILE,
@@ -79,6 +78,36 @@ def _watched(_: click.Context, __: click.Parameter, text: str) -> str:
     if not is_file(text) and not re.fullmatch(r"[A-Za-z0-9_\-*]+(\.[A-Za-z0-9_\-*]+)?", text):
         raise click.BadParameter(f"{text!r} is no machine name: use letters, digits, '_', '-' and '*'")
     return key_of(text)
+
+
+def _replayed(_: click.Context, __: click.Parameter, text: str) -> Path:
+    from otolith.cli.machines import file_of
+
+    return Path(text) if Path(text).is_dir() else file_of(text)
+
+
+def _replay_batch(
+    machines: tuple[Path, ...],
+    data: tuple[Path, ...],
+    output: Path,
+    state: Path | None,
+    jobs: int | None,
+    kind: str | None,
+    cluster: tuple[str | None, Path | None, Path | None, Path | None],
+    stop: StopSignal,
+) -> None:
+    from otolith.cli.replay_batch import replay_batch
+    from otolith.runtime.batch.cluster import ClusterAccess
+    from otolith.runtime.batch.outputs import OutputFormat
+
+    if not data:
+        raise click.UsageError("Missing argument 'DATA...'.")
+    address, *files = cluster
+    access = None if address is None else ClusterAccess(address, *files)
+    if jobs is not None and access is not None:
+        raise click.UsageError("--jobs is for this computer: a cluster has the workers that were started for it")
+    log_to_stderr(verbose=False)
+    replay_batch(machines, data, output, OutputFormat(kind or "jsonl"), state, jobs, access, stop.received)
 
 
 @contextmanager
@@ -183,8 +212,8 @@ def check(file: Path, data: tuple[Path, ...], no_device: bool, as_json: bool) ->
 
 
 @cli.command()
-@MACHINE_FILE
-@DATA_FILES
+@click.argument("path", metavar="PATH", callback=_replayed)
+@click.argument("data", metavar="DATA...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
 @click.option("--recording", type=FILE, callback=_new_recording, help="Record into this file, as the daemon does.")
 @click.option("--report", "page", type=FILE, callback=new_file, metavar="FILE",
@@ -195,8 +224,17 @@ def check(file: Path, data: tuple[Path, ...], no_device: bool, as_json: bool) ->
               help="Use the decisions of this state directory, as a copy of that of another computer.")  # fmt: skip
 @click.option("--real-time", is_flag=True, help="Wait for the end of each window, as in operation.")
 @click.option("--timing", is_flag=True, help="Add computing times, which differ from run to run.")
+@click.option("--output", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+              help="Replay by several processes, and leave reports and checkpoints in this folder.")  # fmt: skip
+@click.option("--jobs", type=click.IntRange(1), metavar="NUMBER",
+              help="With --output: processes; as many as processors without it.")  # fmt: skip
+@click.option("--format", "kind", type=click.Choice(("jsonl", "parquet")), help="With --output.  [default: jsonl]")
+@click.option("--scheduler", metavar="ADDRESS", help="With --output: compute on the cluster of this Dask scheduler.")
+@click.option("--ca", type=FILE, help="With --scheduler tls://...: certificate of its CA.")
+@click.option("--certificate", type=FILE, help="Own certificate, signed by that CA.")
+@click.option("--key", type=FILE, help="Private key of the certificate.")
 def replay(
-    file: Path,
+    path: Path,
     data: tuple[Path, ...],
     as_json: bool,
     recording: Path | None,
@@ -205,14 +243,26 @@ def replay(
     state: Path | None,
     real_time: bool,
     timing: bool,
+    output: Path | None,
+    jobs: int | None,
+    kind: str | None,
+    scheduler: str | None,
+    ca: Path | None,
+    certificate: Path | None,
+    key: Path | None,
 ) -> int:
-    """Run recorded DATA through the daemon for the machine in FILE.
+    """Run recorded DATA through the daemon for the machine in PATH.
 
     DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
     brackets), a recording (.rrd) or a log of a CAN bus (of candump, SavvyCAN or python-can, .asc, .blf, .trc, .mf4).
-    FILE needs [driver] and [signals] only for a log of a bus: they describe its frames.
+    PATH is its machine file or its name. The file needs [driver] and [signals] only for a log of a bus: they describe
+    its frames.
     Each of several files is a recording of its own: no window spans two. The logs of a machine with several sources are
     one recording: drive=monday.log,encoder=monday.csv.
+
+    With --output, PATH may also be a directory of machine files, more machine files may follow it, and DATA may be
+    directories: of several machines, each has the files in a folder of its name, and those that begin with its name.
+    The same command continues a replay that was killed.
 
     \b
     Examples:
@@ -222,11 +272,27 @@ def replay(
       otolith replay my-machine.toml monday.csv --json | jq .parameters.R_a.value
       otolith replay my-machine.toml monday.csv --recording monday.rrd
       otolith replay my-machine.toml monday.csv --report monday.html
+      otolith replay /etc/otolith/hall recordings --output reports --jobs 8
     """
+    machines = (path, *(item for item in data if item.suffix == ".toml"))
+    data, stop = tuple(item for item in data if item.suffix != ".toml"), StopSignal()
+    cluster = scheduler, ca, certificate, key
+    if output is not None:
+        if as_json or real_time or timing or any((recording, page, folder)):
+            raise click.UsageError("--output goes with --state, --jobs, --format and --scheduler only")
+        if scheduler is None and any(cluster):
+            raise click.UsageError("--ca, --certificate and --key are for --scheduler")
+        _replay_batch(machines, data, output, state, jobs, kind, cluster, stop)
+        return stop.code()
+    if jobs or kind or any(cluster):
+        raise click.UsageError("--jobs, --format and --scheduler need --output")
+    if len(machines) > 1 or any(item.is_dir() for item in (path, *data)):
+        raise click.UsageError("several machines, and directories, need --output")
+    if not data:
+        raise click.UsageError("Missing argument 'DATA...'.")
     from otolith.cli.replay import replay
 
-    stop = StopSignal()
-    run = partial(replay, file, data, recording, stopped=stop.received, ending=stop.ending)
+    run = partial(replay, path, data, recording, stopped=stop.received, ending=stop.ending)
     run(page=page, folder=folder, state=state, as_json=as_json, real_time=real_time, timing=timing)
     return stop.code()
 

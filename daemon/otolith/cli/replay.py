@@ -153,7 +153,7 @@ def replay(
                 _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
-        run.state = _with_decisions(machine, run.state, state)
+        run.state = with_decisions(machine, run.state, state)
         with (
             replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
             _history(machine, run, data, page, folder) as keep,
@@ -207,7 +207,7 @@ def _history(
             write_page(page, page_of(history.reader, *history.span))
 
 
-def _with_decisions(machine: LoadedMachine, state: AdaptationState, directory: Path | None) -> AdaptationState:
+def with_decisions(machine: LoadedMachine, state: AdaptationState, directory: Path | None) -> AdaptationState:
     """Return the initial state with the components that the operator approved, and without those rejected.
 
     They change the reports, so standard error tells which file they are from.

@@ -10,6 +10,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -28,7 +29,8 @@ from otolith.storage.recording_files import MIN_FREE_BYTES, recording_file, shor
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
-from otolith_drivers.replay.readers import JoinedReader, MergedReader, Reader, Rows, format_of, holds_frames
+from otolith_drivers.replay.joined import JoinedReader
+from otolith_drivers.replay.readers import MergedReader, Reader, Rows, format_of, holds_frames
 from otolith_drivers.replay.span import SpanReader
 from otolith_drivers.user_dirs import writable
 
@@ -167,49 +169,49 @@ class RealTimePacer:
             time.sleep(min(left, MAX_SLEEP))
 
 
+@dataclass(slots=True)
 class FileTimes:
     """Compares the times of files that are replayed one after the other."""
 
-    def __init__(self, gap: float) -> None:
-        """``gap`` is the time without data between two files, in s, above which it is counted."""
-        self._gap = gap
-        self._path: Path | None = None
-        self._begin = self._end = -math.inf  # of the present file, s
-        self._gaps = self._overlaps = 0
-        self._longest, self._behind_gap = 0.0, ""
-        self._first_overlap = ""
+    gap: float  # Time without data between two files above which it is counted, s
+    name: str = ""  # Of the present file
+    begin: float = -math.inf  # Of the present file, s
+    end: float = -math.inf  # s
+    gaps: int = 0
+    longest: float = 0.0  # s
+    behind_gap: str = ""  # The file after the longest gap
+    overlaps: int = 0
+    first_overlap: str = ""
 
-    def add(self, path: Path, rows: Rows) -> bool:
-        """Note some rows of a file; return whether they are its first."""
-        begin, is_first = float(rows.times[0]), path != self._path
+    def add(self, path: Path, rows: Rows, *, is_first: bool) -> None:
+        """Note some rows of a file, which may be its first ones."""
         if is_first:
-            if self._path is not None:
-                self._compare(begin, path, self._path)
-            self._path, self._begin, self._end = path, begin, -math.inf
-        self._end = max(self._end, float(rows.times.max()))
-        return is_first
+            if self.name:
+                self._compare(float(rows.times[0]), path)
+            self.name, self.begin, self.end = path.name, float(rows.times[0]), -math.inf
+        self.end = max(self.end, float(rows.times.max()))
 
-    def _compare(self, begin: float, path: Path, before: Path) -> None:
-        """Compare the ``begin`` of a file (s) with the end of the file ``before``."""
-        if begin - self._end > self._gap:
-            self._gaps += 1
-            if begin - self._end > self._longest:
-                self._longest, self._behind_gap = begin - self._end, path.name
-        own_clock = begin <= self._begin and not is_of_calendar(begin)  # it counts from its own start
-        if begin <= self._end and not own_clock:
-            self._overlaps += 1
+    def _compare(self, begin: float, path: Path) -> None:
+        """Compare the ``begin`` of a file (s) with the end of the file before."""
+        if begin - self.end > self.gap:
+            self.gaps += 1
+            if begin - self.end > self.longest:
+                self.longest, self.behind_gap = begin - self.end, path.name
+        own_clock = begin <= self.begin and not is_of_calendar(begin)  # it counts from its own start
+        if begin <= self.end and not own_clock:
+            self.overlaps += 1
             begins = f"{path.name} begins at {time_text(begin)}"
-            self._first_overlap = self._first_overlap or f"{begins}, {before.name} ends at {time_text(self._end)}"
+            self.first_overlap = self.first_overlap or f"{begins}, {self.name} ends at {time_text(self.end)}"
 
     def warnings(self) -> list[str]:
         """Return gaps and overlaps, one sentence each."""
         lines = []
-        if self._gaps:
-            longest = f"the longest of {self._longest:.6g} s, before {self._behind_gap}"
-            lines.append(f"times without data between two files: {self._gaps}, {longest}")
-        if self._overlaps:
-            first = f"{self._first_overlap}: give the files in the order of their times"
-            lines.append(f"files that begin before the one above ends: {self._overlaps}: {first}")
+        if self.gaps:
+            longest = f"the longest of {self.longest:.6g} s, before {self.behind_gap}"
+            lines.append(f"times without data between two files: {self.gaps}, {longest}")
+        if self.overlaps:
+            first = f"{self.first_overlap}: give the files in the order of their times"
+            lines.append(f"files that begin before the one above ends: {self.overlaps}: {first}")
         return lines
 
 
@@ -269,11 +271,14 @@ class Replay:
     def windows(self) -> Iterator[Window]:
         """Yield the windows of the file as the daemon would cut them; raises as :meth:`reports`."""
         before, begun, rows = 0.0, 0.0, None  # the shares of the file above the next and the present chunk
+        file: Path | None = None
         for rows in self._data.chunks():
             if self._stopped():
                 return
-            if self._files.add(self._data.file, rows):
-                self._check_times(rows)
+            is_first, file = self._data.file != file, self._data.file
+            self._files.add(file, rows, is_first=is_first)
+            if is_first:
+                check_times(self._data, rows, self._length)
             self.statistics.add(rows)
             begun, before = before, self._data.progress
             yield from self._with_progress(self._player.playback.windows(rows), rows, begun)
@@ -290,27 +295,6 @@ class Replay:
             self.progress = max(self.progress, before + (after - before) * float(done))
             yield window
 
-    def _check_times(self, rows: Rows) -> None:
-        """Raise an error if the first rows of a file show that its times cannot be meant.
-
-        Time runs backwards if most rows that differ from the row above are before it, and the last before the first.
-        """
-        times, steps = rows.times, np.diff(rows.times)
-        if len(times) > 2 and times[-1] < times[0] and 2 * np.count_nonzero(steps < 0.0) > np.count_nonzero(steps):
-            raise ConfigurationError(f"{self._data.file}: time decreases from row to row: sort the rows by t")
-        step = median_step(times)
-        if not self._data.is_table or math.isinf(step) or step * MIN_ROWS_PER_WINDOW <= self._length:
-            return
-        mean = float(steps[steps > 0.0].sum()) / len(steps)  # smaller if times repeat
-        if mean * MIN_ROWS_PER_WINDOW <= self._length:
-            remedy = "write t with all its digits, or remove rows that repeat"
-            raise ConfigurationError(f"{self._data.file}: {_standstill(rows)}: {remedy}")
-        rate = f"one row every {step:.6g} s, but windows of {self._length:g} s"
-        remedy = "if t is not in seconds, name the column 't [ms]' or the like"
-        if 2 * np.count_nonzero(steps == 0.0) > len(steps):
-            remedy += f"; {_standstill(rows)}, so write t with all its digits"
-        raise ConfigurationError(f"{self._data.file}: {rate}: {remedy}")
-
     def summary(self) -> str:
         """Return in one line how much was read."""
         counts = self._player.playback.counts
@@ -320,28 +304,8 @@ class Replay:
 
     def warnings(self) -> list[str]:
         """Return what a user must know of the file before trusting the reports, one sentence each."""
-        counts, unused = self._player.playback.counts, self._player.playback.unused_seconds
         lines = [f"interrupted after {self.progress:.0%} of the data"] if self._stopped() else []
-        lines += [*self._data.warnings(), *self._files.warnings()]
-        if counts.first_late is not None:
-            line, late_time, latest = counts.first_late
-            first = f"the first in {self._data.place} {line}, at {time_text(late_time)} after {time_text(latest)} above"
-            lines.append(f"rows that came after their window was closed: {counts.late}, {first}")
-        if counts.gaps:
-            lines.append(
-                f"gaps longer than a window, skipped: {counts.gaps}, the longest of {counts.longest_gap:.3g} s"
-            )
-        if counts.segments:
-            lines.append(f"recordings in the file: {counts.segments + 1}; each begins with a window of its own")
-        if counts.repeated:
-            lines.append(f"samples at the time of another one, not used twice: {counts.repeated}")
-        if counts.stale:
-            lines.append(f"readings of registers that had not been renewed, not used: {counts.stale}")
-        if self._player.windows_missed:
-            lines.append(f"windows that could not be computed: {self._player.windows_missed}")
-        if unused >= self._length / 2:
-            lines.append(f"the last {unused:.3g} s are too short for a window of {self._length:g} s")
-        return lines
+        return [*lines, *self._data.warnings(), *self._files.warnings(), *self._player.warnings(self._data.place)]
 
     def _why_no_window(self) -> str:
         rows = self._player.playback.counts.rows
@@ -349,8 +313,30 @@ class Replay:
             return (
                 f"all {rows} rows have the same time, {time_text(self.statistics.first)}: write t with all its digits"
             )
-        reason = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} too short for a window of {self._length:g} s"
-        return "; ".join([f"{reason}: record for longer, or shorten [window] length", *self.warnings()])
+        return "; ".join([self._player.why_no_window(), *self.warnings()])
+
+
+def check_times(data: Reader, rows: Rows, length: float) -> None:
+    """Raise ConfigurationError if the first rows of a file show that its times cannot be meant.
+
+    ``length`` is that of a window, s. Time runs backwards if most rows that differ from the row above are before it,
+    and the last before the first.
+    """
+    times, steps = rows.times, np.diff(rows.times)
+    if len(times) > 2 and times[-1] < times[0] and 2 * np.count_nonzero(steps < 0.0) > np.count_nonzero(steps):
+        raise ConfigurationError(f"{data.file}: time decreases from row to row: sort the rows by t")
+    step = median_step(times)
+    if not data.is_table or math.isinf(step) or step * MIN_ROWS_PER_WINDOW <= length:
+        return
+    mean = float(steps[steps > 0.0].sum()) / len(steps)  # smaller if times repeat
+    if mean * MIN_ROWS_PER_WINDOW <= length:
+        remedy = "write t with all its digits, or remove rows that repeat"
+        raise ConfigurationError(f"{data.file}: {_standstill(rows)}: {remedy}")
+    rate = f"one row every {step:.6g} s, but windows of {length:g} s"
+    remedy = "if t is not in seconds, name the column 't [ms]' or the like"
+    if 2 * np.count_nonzero(steps == 0.0) > len(steps):
+        remedy += f"; {_standstill(rows)}, so write t with all its digits"
+    raise ConfigurationError(f"{data.file}: {rate}: {remedy}")
 
 
 def _standstill(rows: Rows) -> str:

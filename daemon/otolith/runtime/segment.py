@@ -8,12 +8,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from otolith.acquisition.playback import Playback, PlaybackState
+from otolith.acquisition.quality import time_text
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine
 from otolith.runtime.worker import perform
 from otolith_drivers.base import Sampling, sampling_of
+from otolith_drivers.errors import counted
 from otolith_drivers.replay.readers import Rows
 
 
@@ -27,6 +29,7 @@ class ReplayState:
     windows: int = 0
     windows_bad: int = 0
     windows_missed: int = 0
+    lost: int = 0  # Samples that were sent but are not in the data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,12 +54,11 @@ def replay_segment(
 
     ``is_last`` says that no further sample comes, so no window waits for one. Nothing that was given is changed.
     """
-    player, lost, reports = Player(machine, state), 0, list[Report | None]()
+    player, reports = Player(machine, state), list[Report | None]()
     for part in samples:
-        lost = part.lost
-        reports += [player.adapt(window, lost) for window in player.playback.windows(part.rows)]
+        reports += [player.adapt(window, part.lost) for window in player.playback.windows(part.rows)]
     if is_last:
-        reports += [player.adapt(window, lost) for window in player.playback.rest()]
+        reports += [player.adapt(window, player.state.lost) for window in player.playback.rest()]
     return [report for report in reports if report is not None], player.state
 
 
@@ -69,7 +71,7 @@ class Player:
         self.playback = Playback(plans, machine.records, window.sample_period, machine.limits, machine.observed)
         if state.playback is not None:
             self.playback.restore(state.playback)
-        self._state, self._timing = state, timing
+        self._state, self._timing, self._length = state, timing, window.length
 
     @property
     def state(self) -> ReplayState:
@@ -109,6 +111,7 @@ class Player:
             windows=before.windows + 1,
             windows_bad=before.windows_bad + (window.quality.verdict is Verdict.BAD),
             windows_missed=before.windows_missed + (result.report is None),
+            lost=lost,
         )
         if result.report is None:
             return None
@@ -124,3 +127,33 @@ class Player:
         )
         document = result.report.document.model_copy(update={"counters": counters, "cost": cost})
         return Report(document, result.report.traces)
+
+    def warnings(self, place: str) -> list[str]:
+        """Return what became of the rows, one sentence each; ``place`` is what their lines number."""
+        counts, unused, length = self.playback.counts, self.playback.unused_seconds, self._length
+        lines = []
+        if counts.first_late is not None:
+            line, late_time, latest = counts.first_late
+            first = f"the first in {place} {line}, at {time_text(late_time)} after {time_text(latest)} above"
+            lines.append(f"rows that came after their window was closed: {counts.late}, {first}")
+        if counts.gaps:
+            lines.append(
+                f"gaps longer than a window, skipped: {counts.gaps}, the longest of {counts.longest_gap:.3g} s"
+            )
+        if counts.segments:
+            lines.append(f"recordings in the file: {counts.segments + 1}; each begins with a window of its own")
+        if counts.repeated:
+            lines.append(f"samples at the time of another one, not used twice: {counts.repeated}")
+        if counts.stale:
+            lines.append(f"readings of registers that had not been renewed, not used: {counts.stale}")
+        if self.windows_missed:
+            lines.append(f"windows that could not be computed: {self.windows_missed}")
+        if unused >= length / 2:
+            lines.append(f"the last {unused:.3g} s are too short for a window of {length:g} s")
+        return lines
+
+    def why_no_window(self) -> str:
+        """Return why no row was in a window."""
+        rows = self.playback.counts.rows
+        reason = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} too short for a window of {self._length:g} s"
+        return f"{reason}: record for longer, or shorten [window] length"

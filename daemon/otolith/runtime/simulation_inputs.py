@@ -15,7 +15,8 @@ from otolith.machine import LoadedMachine
 from otolith.runtime.replay import Replay, open_by_name, open_recorded, open_span
 from otolith.simulation.plan import MAX_RECORDS, follows
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.readers import Reader, Rows, costs_a_process, holds_frames
+from otolith_drivers.replay.joined import costs_a_process
+from otolith_drivers.replay.readers import Reader, Rows, holds_frames
 from otolith_drivers.replay.span import SpanReader
 
 MAX_LEAD = 5  # windows of a recording, one of which must be usable. docs/reference/thresholds-runtime.md

@@ -1,7 +1,4 @@
-"""Recorded files: the rows that every reader returns, the file under it, the formats, and several files as one.
-
-Files follow one another, or are merged by the times of their rows.
-"""
+"""Recorded files: the rows that every reader returns, the file under it, the formats, and files merged by time."""
 
 import gzip
 import io
@@ -35,7 +32,6 @@ Integers = NDArray[np.int64]
 # Seconds since 1970 reach 1e11 in the year 5138; milliseconds since 1970 passed it in 1973, so a column of them without
 # its unit is refused. Guarded by tests/golden/replays/nanoseconds.
 MAX_TIME = 1e11  # s
-MAX_LISTED = 16  # files whose rows are counted one by one in a summary
 BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is recognised
 
 # Formats by the end of the file name. The module is imported only when a file asks for it.
@@ -339,121 +335,6 @@ class _TruncatedGzip(io.RawIOBase):
     def close(self) -> None:
         self._file.close()
         super().close()
-
-
-class JoinedReader(Reader):
-    """Reads files one after the other, in the order given, of which one is open at a time."""
-
-    def __init__(self, paths: Sequence[Path], open_file: Callable[[Path], Reader]) -> None:
-        """Try all files; raise ConfigurationError if one cannot be opened, or their times have different meanings.
-
-        Of a recording, which costs a process to open, only the first one is opened here; see :meth:`chunks`.
-        """
-        super().__init__(paths[0])
-        self._paths, self._open_file = tuple(paths), open_file
-        self._reader: Reader | None = None  # The present one, from which rows come
-        self._rows = self._read = self._bad = self._lost = 0  # Rows; files that were read, and what was bad and lost
-        self._summaries: list[str] = []  # Of the files that were read, as are the warnings
-        self._warnings: list[str] = []
-        self._first: Reader | None = open_file(paths[0])
-        first = self._first
-        self.place, self.is_table, self.sampling = f"its file's {first.place}", first.is_table, first.sampling
-        self._description, ignored = first.describe(), list(first.ignored)
-        try:
-            for path in paths[1:]:
-                if costs_a_process(path):
-                    continue
-                with open_file(path) as reader:
-                    self._check(reader)
-                    ignored += reader.ignored
-        except BaseException:
-            self.__exit__(None, None, None)
-            raise
-        self.ignored = tuple(dict.fromkeys(ignored))
-
-    def _check(self, reader: Reader) -> None:
-        if reader.sampling != self.sampling:
-            kinds = f"{_kind(reader.sampling)} times, but {self.path} has {_kind(self.sampling)} ones"
-            raise ConfigurationError(f"{reader.path}: {kinds}: replay them apart")
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if self._first is not None:
-            self._first.__exit__(kind, error, _)
-
-    @property
-    def progress(self) -> float:
-        """Share of the files that was read, 0 to 1."""
-        return (self._read + (self._reader.progress if self._reader else 0.0)) / len(self._paths)
-
-    @property
-    def file(self) -> Path:
-        return self._paths[min(self._read, len(self._paths) - 1)]
-
-    @property
-    def bad(self) -> int:
-        return self._bad + (self._reader.bad if self._reader else 0)
-
-    @property
-    def lost(self) -> int:
-        return self._lost + (self._reader.lost if self._reader else 0)
-
-    def chunks(self) -> Iterator[Rows]:
-        """See :meth:`Reader.chunks`; the first row of each file but the first is marked.
-
-        A recording after the first one is opened only here, so its error ends the reading.
-        """
-        for number, path in enumerate(self._paths):
-            opened, self._first = self._first or self._open_file(path), None
-            with opened as reader:
-                self._check(reader)
-                self._reader = reader
-                is_first = number > 0
-                for rows in reader.chunks():
-                    marks: Mask = rows.begins.copy()
-                    marks[0] |= is_first
-                    is_first = False
-                    self._rows += len(rows.times)
-                    yield Rows(rows.times, rows.columns, rows.lines, rows.bad + self._bad, marks)
-            self._finish(reader)
-
-    def _finish(self, reader: Reader) -> None:
-        """Keep of a file that was read its counts and warnings alone: there may be thousands."""
-        self._summaries.append(_summary(reader))
-        self._warnings += [f"{reader.path}: {line}" for line in reader.warnings()]
-        self._bad, self._lost, self._reader = self._bad + reader.bad, self._lost + reader.lost, None
-        self._read += 1
-
-    def summary_lines(self) -> list[str]:
-        if len(self._paths) > MAX_LISTED:
-            return [f"{self._rows} rows of {self._read} of {len(self._paths)} files read", f"{self.bad} bad"]
-        lines = self._summaries + ([] if self._reader is None else [_summary(self._reader)])
-        return lines + [f"{path.name}: not read" for path in self._paths[len(lines) :]]
-
-    def warnings(self) -> list[str]:
-        reader = self._reader
-        return self._warnings + ([] if reader is None else [f"{reader.path}: {line}" for line in reader.warnings()])
-
-    def describe(self) -> list[str]:
-        return [*self._description, f"from {len(self._paths)} files, each a recording of its own"]
-
-
-def _summary(reader: Reader) -> str:
-    return f"{reader.path.name}: {', '.join(reader.summary_lines())}"
-
-
-def costs_a_process(path: Path) -> bool:
-    """Whether ``path`` is a recording; raise ConfigurationError if it has only the name of one, or is missing."""
-    if suffix_of(path) != RECORDING:
-        return False
-    DataFile(path).close()  # raises if it cannot be read
-    if not head_of(path).startswith(RECORDING_HEAD):
-        raise ConfigurationError(f"{path}: is no recording of Rerun, which its name says")
-    return True
-
-
-def _kind(kinds: Sampling | Mapping[str, Sampling]) -> str:
-    """Return the meaning of the times of a file in words."""
-    return kinds if isinstance(kinds, Sampling) else ", ".join(f"{name} {kind}" for name, kind in kinds.items())
 
 
 class _Feed:

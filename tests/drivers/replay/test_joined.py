@@ -11,7 +11,8 @@ from otolith.acquisition.playback import Playback
 from otolith.acquisition.samples import SignalPlan
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.readers import JoinedReader, Reader
+from otolith_drivers.replay.joined import JoinedReader
+from otolith_drivers.replay.readers import Reader
 from otolith_drivers.replay.table.reader import TableReader
 from tests.messages import assert_each_says, raises_saying
 
