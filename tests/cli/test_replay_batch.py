@@ -25,7 +25,7 @@ from tests.cli.commands import otolith
 from tests.cli.replays import MACHINE, recorded
 from tests.cli.test_replay_files import file_of
 from tests.conftest import EXAMPLES
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 
 BEGIN = 1_790_000_000.0  # Unix s
 
@@ -157,6 +157,23 @@ def test_a_worker_that_is_killed_costs_no_report(plant: Path, serial: dict[str, 
         workers.close()
     assert killed
     assert {name: written(tmp_path, name) for name in serial} == serial
+
+
+class Deadly(EachChunk):
+    """Loses each task of one machine."""
+
+    def finished(self) -> list[tuple[str, Outcome | None, str]]:
+        done = super().finished()
+        return [(key, None, "gone") if key == "site.ill" else (key, outcome, "") for key, outcome, _ in done]
+
+
+def test_a_task_that_kills_its_workers_ends_its_machine_only(
+    plant: Path, serial: dict[str, str], tmp_path: Path
+) -> None:
+    items = [replay_of(plant, name, tmp_path) for name in serial]
+    run_batch(items, Deadly(), lambda: False, lambda _: None)
+    assert_says(items[0].failure, "gone", "3")
+    assert written(tmp_path, "well") == serial["well"]
 
 
 def test_a_batch_whose_process_is_killed_is_continued(plant: Path, serial: dict[str, str], tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ SOURCES = {
     "opcua": [DRIVERS / "opcua"],
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay", DRIVERS / "replay" / "table", DRIVERS / "replay" / "exports"],
-    "runtime": [DAEMON / "runtime", DAEMON / "runtime" / "hall", DAEMON / "publishing", DAEMON],
+    "runtime": [DAEMON / "runtime", *(DAEMON / "runtime").glob("*/"), DAEMON / "publishing", DAEMON],
     "site": [DAEMON / "site", *(DAEMON / "site").glob("*/")],
     "simulation": [DAEMON / "simulation"],
     "storage": [DAEMON / "storage"],

@@ -99,7 +99,7 @@ class ClusterWorkers:
         """Wait for a moment, and return what was finished: key, outcome, and why there is none."""
         from distributed import wait  # noqa: PLC0415 - of the extra
 
-        with contextlib.suppress(TimeoutError):
+        with self._client.as_current(), contextlib.suppress(TimeoutError):
             wait(list(self._futures.values()), timeout=POLL, return_when="FIRST_COMPLETED")  # type: ignore[no-untyped-call]
         if self._client.status not in ("running", "connecting"):
             raise ServiceError(f"scheduler {self._address}: the connection is lost: start again to continue")
