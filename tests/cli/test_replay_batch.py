@@ -17,7 +17,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.batch.batch import MachineReplay, machine_replay, run_batch
 from otolith.runtime.batch.local import LocalWorkers
 from otolith.runtime.batch.outputs import OutputFormat, opened_output
-from otolith.runtime.batch.task import Outcome, Task, perform_task
+from otolith.runtime.batch.task import ReplayOutcome, ReplayTask, perform_task
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario
@@ -84,14 +84,14 @@ class EachChunk:
 
     def __init__(self, *, is_lossy: bool = False) -> None:
         self.is_lossy = is_lossy
-        self.tasks = list[tuple[str, Task]]()
+        self.tasks = list[tuple[str, ReplayTask]]()
         self.count = 0
 
-    def submit(self, key: str, task: Task) -> None:
+    def submit(self, key: str, task: ReplayTask) -> None:
         self.tasks.append((key, task))
 
-    def finished(self) -> list[tuple[str, Outcome | None, str]]:
-        done = list[tuple[str, Outcome | None, str]]()
+    def finished(self) -> list[tuple[str, ReplayOutcome | None, str]]:
+        done = list[tuple[str, ReplayOutcome | None, str]]()
         for key, task in self.tasks:
             self.count += 1
             is_lost = self.is_lossy and self.count % 2 == 0
@@ -162,7 +162,7 @@ def test_a_worker_that_is_killed_costs_no_report(plant: Path, serial: dict[str, 
 class Deadly(EachChunk):
     """Loses each task of one machine."""
 
-    def finished(self) -> list[tuple[str, Outcome | None, str]]:
+    def finished(self) -> list[tuple[str, ReplayOutcome | None, str]]:
         done = super().finished()
         return [(key, None, "gone") if key == "site.ill" else (key, outcome, "") for key, outcome, _ in done]
 

@@ -17,7 +17,7 @@ from otolith.adaptation.fingerprints import twin_fingerprint
 from otolith.adaptation.state import AdaptationState
 from otolith.machine import LoadedMachine
 from otolith.runtime.batch.outputs import MachineOutput, OutputFormat
-from otolith.runtime.batch.task import MAX_TASK_FILES, Outcome, Task, first_checkpoint, libraries, unpacked
+from otolith.runtime.batch.task import MAX_TASK_FILES, ReplayOutcome, ReplayTask, first_checkpoint, libraries, unpacked
 from otolith.storage.exact_json import encoded
 from otolith_drivers.errors import ConfigurationError, OtolithError
 
@@ -35,10 +35,10 @@ class Workers(Protocol):
     def room(self) -> int:
         """Number of tasks that can be submitted now."""
 
-    def submit(self, key: str, task: Task) -> None:
+    def submit(self, key: str, task: ReplayTask) -> None:
         """Let a worker compute a task."""
 
-    def finished(self) -> list[tuple[str, Outcome | None, str]]:
+    def finished(self) -> list[tuple[str, ReplayOutcome | None, str]]:
         """Wait for a moment, and return what was finished: key, outcome, and why there is none."""
 
     def close(self) -> None:
@@ -67,13 +67,13 @@ class MachineReplay:
         """Whether nothing more is to be computed."""
         return self.output.is_done or bool(self.failure)
 
-    def task(self, seconds: float) -> Task:
+    def task(self, seconds: float) -> ReplayTask:
         """Return the next task."""
         files = self.files[self.read : self.read + MAX_TASK_FILES]
         is_end = self.read + len(files) == len(self.files)
-        return Task(self.machine.path.absolute(), files, is_end, self.begin, seconds)
+        return ReplayTask(self.machine.path.absolute(), files, is_end, self.begin, seconds)
 
-    def take(self, outcome: Outcome) -> None:
+    def take(self, outcome: ReplayOutcome) -> None:
         """Keep an outcome; raise as :meth:`MachineOutput.keep`."""
         self.output.keep(outcome)
         self.attempts, self.failure, self.begin = 0, outcome.failure, outcome.checkpoint

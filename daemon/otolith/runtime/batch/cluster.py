@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from otolith.runtime.batch.task import Outcome, Task, libraries, perform_task
+from otolith.runtime.batch.task import ReplayOutcome, ReplayTask, libraries, perform_task
 from otolith_drivers.errors import ConfigurationError, ServiceError, installation_of
 
 log = logging.getLogger(__name__)
@@ -91,11 +91,11 @@ class ClusterWorkers:
         workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
         return max(0, TASKS_PER_WORKER * max(workers, 1) - len(self._futures))
 
-    def submit(self, key: str, task: Task) -> None:
+    def submit(self, key: str, task: ReplayTask) -> None:
         """Let a worker compute a task; the scheduler gives it to another one if that worker ends."""
         self._futures[key] = self._client.submit(perform_task, task, pure=False)
 
-    def finished(self) -> list[tuple[str, Outcome | None, str]]:
+    def finished(self) -> list[tuple[str, ReplayOutcome | None, str]]:
         """Wait for a moment, and return what was finished: key, outcome, and why there is none."""
         from distributed import wait  # noqa: PLC0415 - of the extra
 
@@ -103,7 +103,7 @@ class ClusterWorkers:
             wait(list(self._futures.values()), timeout=POLL, return_when="FIRST_COMPLETED")  # type: ignore[no-untyped-call]
         if self._client.status not in ("running", "connecting"):
             raise ServiceError(f"scheduler {self._address}: the connection is lost: start again to continue")
-        done = list[tuple[str, Outcome | None, str]]()
+        done = list[tuple[str, ReplayOutcome | None, str]]()
         for key, future in list(self._futures.items()):
             if future.status == "pending":
                 continue

@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from otolith import kernel_cache
-from otolith.runtime.batch.task import Outcome, Task, perform_task
+from otolith.runtime.batch.task import ReplayOutcome, ReplayTask, perform_task
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import OtolithError
 
@@ -29,7 +29,7 @@ def main(connection: Any) -> None:
                 has_compiled = False
 
 
-def answer(task: Task) -> Outcome | str:
+def answer(task: ReplayTask) -> ReplayOutcome | str:
     """Return the outcome of a task, or why there is none."""
     try:
         return perform_task(task)
@@ -52,25 +52,25 @@ class LocalWorkers:
         """Number of tasks that can be submitted now."""
         return sum(worker.alive and number not in self._computed for number, worker in enumerate(self._workers))
 
-    def submit(self, key: str, task: Task) -> None:
+    def submit(self, key: str, task: ReplayTask) -> None:
         """Let a free worker compute a task."""
         number = next(n for n, worker in enumerate(self._workers) if worker.alive and n not in self._computed)
         self._computed[number] = key
         self._workers[number].offer(task)
 
-    def finished(self) -> list[tuple[str, Outcome | None, str]]:
+    def finished(self) -> list[tuple[str, ReplayOutcome | None, str]]:
         """Wait for a moment, and return what was finished: key, outcome, and why there is none."""
         waitables = [waitable for worker in self._workers for waitable in worker.waitables]
         if waitables:
             multiprocessing.connection.wait(waitables, timeout=POLL)
         else:
             time.sleep(POLL)
-        done = list[tuple[str, Outcome | None, str]]()
+        done = list[tuple[str, ReplayOutcome | None, str]]()
         for number, worker in enumerate(self._workers):
             for reply in worker.replies():
                 worker.reset_backoff()
                 key = self._computed.pop(number)
-                done.append((key, reply, "") if isinstance(reply, Outcome) else (key, None, reply))
+                done.append((key, reply, "") if isinstance(reply, ReplayOutcome) else (key, None, reply))
             if not worker.alive:
                 if (lost := self._computed.pop(number, None)) is not None:
                     done.append((lost, None, GONE))

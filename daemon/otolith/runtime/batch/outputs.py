@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from otolith.health.schema import ReportDocument
-from otolith.runtime.batch.task import Outcome
+from otolith.runtime.batch.task import ReplayOutcome
 from otolith.storage.disk import replace_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import writable
 
 LOCK = "replay.lock"
-CHECKPOINT, WARNINGS = ".checkpoint", ".warnings.txt"
+CHECKPOINT, WARNINGS = ".checkpoint", ".warnings"
 MAX_HEAD = 1 << 16  # bytes of the first line of a checkpoint
 
 
@@ -148,7 +148,7 @@ class MachineOutput:
         """Warnings that were kept."""
         return int(self._head["warnings"])
 
-    def keep(self, outcome: Outcome) -> None:
+    def keep(self, outcome: ReplayOutcome) -> None:
         """Append an outcome, and keep its checkpoint.
 
         Raises:

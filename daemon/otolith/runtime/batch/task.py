@@ -72,7 +72,7 @@ def _unpacked(machine: LoadedMachine, data: bytes) -> Checkpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ReplayTask:
     """A part of the recordings of a machine that begins where a checkpoint ends."""
 
     machine: Path
@@ -83,7 +83,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ReplayOutcome:
     """The reports of a task in their order, and where the next task begins."""
 
     reports: tuple[str, ...]  # JSON
@@ -93,7 +93,7 @@ class Outcome:
     failure: str = ""  # Why the files cannot be replayed after these reports; empty if they can
 
 
-def perform_task(task: Task) -> Outcome:
+def perform_task(task: ReplayTask) -> ReplayOutcome:
     """Return the outcome of a task.
 
     Raises:
@@ -127,7 +127,7 @@ def _loaded(path: Path, _: int) -> LoadedMachine:
     return machine
 
 
-def _perform(machine: LoadedMachine, task: Task, begin: Checkpoint) -> Outcome:
+def _perform(machine: LoadedMachine, task: ReplayTask, begin: Checkpoint) -> ReplayOutcome:
     reports, warnings, checkpoint, failure = list[str](), list[str](), begin, ""
     length, deadline, is_whole = machine.file.window.length, time.monotonic() + task.seconds, False
     try:
@@ -157,7 +157,7 @@ def _perform(machine: LoadedMachine, task: Task, begin: Checkpoint) -> Outcome:
                 checkpoint = replace(checkpoint, state=state, is_done=True)
     except OtolithError as error:
         failure = str(error)
-    return Outcome(tuple(reports), tuple(warnings), checkpoint.packed(), checkpoint.is_done, failure)
+    return ReplayOutcome(tuple(reports), tuple(warnings), checkpoint.packed(), checkpoint.is_done, failure)
 
 
 def _require_sampling(machine: LoadedMachine, data: JoinedReader, begin: Checkpoint) -> None:
