@@ -9,15 +9,18 @@ from typing import cast
 
 import pytest
 
-from otolith.health.schema import Language
+from otolith.health.limits import Level
+from otolith.health.schema import HealthDocument, Language
 from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.metrics import Metrics
 from otolith.site.outlets import runner
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.mail import Mail
+from otolith.site.outlets.notices import LASTING, Silences
 from otolith.site.outlets.options import MailOutlet
 from otolith.site.outlets.runner import OutletRunner
+from otolith.site.words import words_in
 from tests.sites.machines import raised, report_of, sent
 from tests.storage.histories import START
 from tests.waiting import wait_for
@@ -94,6 +97,20 @@ def test_views_and_notices_are_in_language_and_zone_of_the_site(
                   OutletSetup(Path(), "Works"))._message([Notice("hall-1", "a", Told.RAISED, event)])  # fmt: skip
     assert condition in letter["subject"]
     assert moment in letter.get_content()
+
+
+@pytest.mark.parametrize(("language", "said"), [(None, "de"), ("en", "en")])
+def test_silence_is_told_in_language_and_zone_of_the_site_or_else_of_the_machine(
+    language: Language | None, said: Language
+) -> None:
+    report, knowledge, silences = report_of("a"), Knowledge(), Silences()
+    health = HealthDocument(state=Level.OK, since=START, parts={}, language="de", timezone="Asia/Tokyo")
+    knowledge.take(*sent(report.model_copy(update={"health": health})), START)
+    for now in (START + 1000.0, START + 1000.0 + LASTING):
+        found = silences.take(knowledge, now, now, language)
+    (event,) = (notice.event for notice in found)
+    assert (event.language, event.timezone) == (said, "Asia/Tokyo")
+    assert event.condition == words_in(said)["silence"]
 
 
 def test_a_machine_that_is_gone_while_the_outlet_fails_is_told_to_be_gone() -> None:

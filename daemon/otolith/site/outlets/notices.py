@@ -82,8 +82,10 @@ class Silences:
         self._since: dict[tuple[str, str], float] = {}  # When a machine became other than what was told of it
         self._told: dict[tuple[str, str], EventDocument] = {}  # Those of which is told that they are silent
 
-    def take(self, machines: Iterable[KnownMachine], now: float, wall: float, language: Language) -> list[Notice]:
-        """Return what has not been told; ``wall`` is Unix time."""
+    def take(
+        self, machines: Iterable[KnownMachine], now: float, wall: float, language: Language | None
+    ) -> list[Notice]:
+        """Return what has not been told, in a language, by default that of each machine; ``wall`` is Unix time."""
         own = {(machine.site, machine.name): machine for machine in machines}
         for known in (self._since, self._told):
             for key in known.keys() - own.keys():
@@ -91,7 +93,7 @@ class Silences:
         return [notice for key, machine in own.items() if (notice := self._of(key, machine, now, wall, language))]
 
     def _of(
-        self, key: tuple[str, str], machine: KnownMachine, now: float, wall: float, language: Language
+        self, key: tuple[str, str], machine: KnownMachine, now: float, wall: float, language: Language | None
     ) -> Notice | None:
         told = self._told.get(key)
         if machine.is_silent(now) is (told is not None):
@@ -102,17 +104,20 @@ class Silences:
             if told is not None:
                 del self._told[key]
                 return Notice(*key, Told.CLEARED, told.model_copy(update={"end": heard}))
-            self._told[key] = _silence(heard, language)
+            self._told[key] = _silence(heard, machine, language)
             return Notice(*key, Told.RAISED, self._told[key])
         return None
 
 
-def _silence(since: float, language: Language) -> EventDocument:
+def _silence(since: float, machine: KnownMachine, language: Language | None) -> EventDocument:
     """Return the silence of a machine as an event."""
+    health = machine.report.health if machine.report else None
+    language = language or (health.language if health else "en")
     words = words_in(language)
     return EventDocument(
         id=f"silent@{since:.3f}", part="", state=Level.NO_DATA, start=since, since=since, condition=words["silence"],
         text=words["silence_text"], advice=texts_in(language)("check_daemon"), language=language,
+        timezone=health.timezone if health else None,
         evidence=EvidenceDocument(windows=(0, 0)),
     )  # fmt: skip
 

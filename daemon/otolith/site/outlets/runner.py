@@ -90,11 +90,11 @@ class OutletRunner:
 
     def _pass_on(self) -> bool:
         """Pass on what has changed; return whether the other side was reached."""
-        now, language = time.monotonic(), self._setup.language or "en"
+        now, language = time.monotonic(), self._setup.language
         with self._collector.lock:
             machines = list(self._collector.knowledge)
-            new = [self._reworded(notice) for notice in self._notices.take(machines, now)]
-            new += self._silences.take(machines, now, time.time(), language)
+            new = [*self._notices.take(machines, now), *self._silences.take(machines, now, time.time(), language)]
+            new = [self._reworded(notice) for notice in new]
             changed = [view for machine in machines if (view := self._view(machine, now)) is not None]
         self._pending.extend(self._limit.passes(new, now))
         while len(self._pending) > MAX_PENDING:
