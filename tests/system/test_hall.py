@@ -1,86 +1,24 @@
 """Several machines in one daemon: what is wrong with one of them harms no other."""
 
 import os
-import queue
 import signal
-import subprocess
-import sys
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from otolith.cli.run import serve
 from otolith.health.limits import Level
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
-from otolith.publishing.subscriber import Subscriber
-from otolith.publishing.zenoh_config import Connection
 from otolith.storage.history import HistoryReader, history_path
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
-from tests.conftest import EXAMPLES
 from tests.messages import raises_saying
-from tests.waiting import PATIENCE, wait_for
+from tests.system.halls import RunningHall, write
 
 GOOD = ("one", "two")
 LEARNED_BY_ANOTHER = "what another daemon has learned"
-ENDPOINT = "unixsock-stream/{folder}/reports.sock"
-
-
-def write(folder: Path, name: str, driver: str = "", **changes: str) -> None:
-    """Write the file of a machine that is simulated in the daemon."""
-    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
-    text = text.replace('"dc-motor-in-process"', f'"{name}"').replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    if driver:
-        text = text.replace(text[text.index("[driver]") : text.index("[signals]")], f"[driver]\n{driver}\n")
-    endpoint = ENDPOINT.format(folder=folder.parent)
-    (folder / f"{name}.toml").write_text(f'{text}\n[zenoh]\nlisten = ["{endpoint}"]\n', encoding="utf-8")
-
-
-class RunningHall:
-    """A daemon for the machines of a folder, and what it publishes of each."""
-
-    def __init__(self, folder: Path) -> None:
-        self.log = folder.parent / "daemon.log"
-        with self.log.open("wb") as log:
-            command = [sys.executable, "-m", "otolith", "run", str(folder), "--workers", "2"]
-            self.daemon = subprocess.Popen(command, stdout=log, stderr=log)
-        self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._subscriber = Subscriber(Connection((ENDPOINT.format(folder=folder.parent),)), self._received.put)
-        self.reports: defaultdict[str, list[ReportDocument]] = defaultdict(list)
-
-    def have(self, count: int, *names: str) -> None:
-        """Wait until each of the machines has published ``count`` further reports."""
-        self.read()
-        wanted = {name: len(self.reports[name]) + count for name in names}
-
-        def enough() -> bool:
-            assert self.daemon.poll() is None, self.log.read_text()
-            self.read()
-            return all(len(self.reports[name]) >= number for name, number in wanted.items())
-
-        wait_for(enough, 3 * PATIENCE)
-
-    def read(self) -> None:
-        while not self._received.empty():
-            report = ReportDocument.from_json(self._received.get())
-            self.reports[report.machine].append(report)
-
-    def children(self) -> list[psutil.Process]:
-        """The workers and the recorder."""
-        children = psutil.Process(self.daemon.pid).children()
-        return sorted((p for p in children if "spawn_main" in " ".join(p.cmdline())), key=lambda p: p.create_time())
-
-    def close(self) -> int:
-        self._subscriber.__exit__(None, None, None)
-        self.daemon.send_signal(signal.SIGTERM)
-        return self.daemon.wait(timeout=PATIENCE)
 
 
 @pytest.fixture
