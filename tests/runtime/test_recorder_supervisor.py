@@ -241,7 +241,7 @@ def test_the_environment_may_switch_recordings_off(
 def test_machines_share_a_process_and_a_disk_that_fails_concerns_one_of_them(
     machine: LoadedMachine, tmp_path: Path
 ) -> None:
-    whole, supervisors = RecorderProcess(2), list[RecorderSupervisor]()
+    whole, supervisors = RecorderProcess(), list[RecorderSupervisor]()
     for number in range(2):
         identity = machine.file.machine.model_copy(update={"name": f"motor-{number}"})
         folder = machine.file.recording.model_copy(update={"folder": tmp_path / f"recordings-{number}"})

@@ -10,6 +10,7 @@ from otolith.adaptation.state import with_problem
 from otolith.health.prognosis import Baseline
 from otolith.health.schema import EventChange
 from otolith.machine import load_machine
+from otolith.runtime.hall.changes import changes_of_one
 from otolith.runtime.service import Reload, Service, reloaded
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
@@ -100,7 +101,10 @@ def test_a_file_that_vanishes_during_a_reload_does_not_end_the_daemon(
         raise ConfigurationError("dc-motor-in-process.toml: no such file")
 
     monkeypatch.setattr("otolith.runtime.service.files_of", vanished)
-    service.reload()
+    changes = changes_of_one(service)
+    assert not changes.revised
+    ((kept, reason),) = changes.kept
+    kept.refuse(reason)
     assert "not reloaded, the daemon goes on as before: dc-motor-in-process.toml: no such file" in caplog.text
 
 
@@ -113,7 +117,7 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     store = store_of(service._loaded)
     store.operator.write(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
     path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
-    service.reload()
+    service.take_over(service.revision(load_machine(path)))
     limited = service.machine.next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)

@@ -167,7 +167,7 @@ def run(
     PATH is a machine file, the name of a machine, or a directory of machine files. The machines of several files share
     the processes of one daemon: a hall.
     It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits, rules,
-    [recording], certificates and readers from the files.
+    [recording], certificates and readers from the files, and in a hall files that were added, changed or removed.
 
     \b
     Examples:

@@ -5,10 +5,11 @@ own, and a thread tries the rest again. It also looks whether certificates or pa
 sessions anew.
 """
 
+import contextlib
 import logging
 import math
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
@@ -24,6 +25,7 @@ from otolith.publishing.zenoh_session import (
     EVENT,
     PARAMETER,
     REPORT,
+    ROOT,
     START,
     StartDocument,
     Topic,
@@ -81,14 +83,17 @@ class _Endpoints:
             yield _Endpoints(connect=self.connect)
 
 
+Declared = zenoh.Publisher | zenoh.Queryable[None] | zenoh.LivelinessToken
+
+
 @dataclass(frozen=True, slots=True)
 class _Session:
     """A session, and what is declared in it for as long as it is open."""
 
     endpoints: _Endpoints
     opened: zenoh.Session
-    reports: Mapping[tuple[str, str], zenoh.Publisher]  # By site and machine
-    declared: tuple[object, ...]
+    reports: dict[tuple[str, str], zenoh.Publisher]  # By site and machine, as what else is declared of it
+    declared: dict[tuple[str, str], tuple[Declared, ...]]
     access: Access
     stamps: tuple[object, ...]  # Of the files of ``access`` when it was opened
 
@@ -101,14 +106,18 @@ class Publisher:
         machines: Sequence[Published],
         listen: Iterable[str],
         access: Access = Access(),  # noqa: B008 - immutable
+        *,
+        of_hall: bool = False,
     ) -> None:
         """Where they listen on a socket of this computer, it has the name of the first machine.
+
+        That of a hall may publish machines of any name, as some may be added later.
 
         Raises:
             ConfigurationError: the machine file, or a file that it names, is wrong.
         """
         self._machines = {(each.site, each.machine): each for each in machines}
-        self._first, self._access = machines[0], access
+        self._first, self._listen, self._access, self._of_hall = machines[0], tuple(listen), access, of_hall
         self._lock, self._closing, self._wake = threading.Lock(), threading.Event(), threading.Event()
         self._validity, self._warned_on = Validity(), date.min
         # When it was last told that a certificate expires, by its end; Unix s
@@ -118,7 +127,7 @@ class Publisher:
         self._sessions: tuple[_Session, ...] = ()
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
         self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
-        everything = _Endpoints(tuple(listen), tuple(access.zenoh.connect))
+        everything = _Endpoints(self._listen, tuple(access.zenoh.connect))
         try:
             self._open(everything)
         except UNAVAILABLE as error:
@@ -132,6 +141,39 @@ class Publisher:
         with self._lock:
             return ", ".join(each.endpoints.text for each in self._sessions) or "no endpoint yet"
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether it publishes no machine."""
+        return not self._machines
+
+    def shares(self, listen: tuple[str, ...], access: Access) -> bool:
+        """Whether machines with these endpoints, readers and certificates have the same session."""
+        own = self._access
+        return (self._listen, own.zenoh, own.path.parent.absolute()) == (
+            listen,
+            access.zenoh,
+            access.path.parent.absolute(),
+        )
+
+    def add(self, machine: Published) -> None:
+        """Publish a further machine; readers that are connected find it."""
+        with self._lock:
+            self._machines[machine.site, machine.machine] = machine
+            for each in self._sessions:
+                self._declare(each, machine)
+
+    def remove(self, site: str, machine: str) -> None:
+        """Publish a machine no longer; subscribers see its liveliness token disappear."""
+        name, ended = (site, machine), list[Declared]()
+        with self._lock:
+            self._machines.pop(name, None)
+            for each in self._sessions:
+                ended += each.declared.pop(name, ())
+                each.reports.pop(name, None)
+        for declared in ended:  # without the lock, for which an answer that is under way may wait
+            with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
+                declared.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+
     def publish(self, document: ReportDocument) -> None:
         """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
         text = document.to_json()
@@ -142,6 +184,8 @@ class Publisher:
         texts = [(key, item.json_line()) for key, item in others]
         name = document.site, document.machine
         with self._lock:  # so that no session is closed meanwhile
+            if name not in self._machines:
+                return
             self._machines[name].latest = text
             for each in self._sessions:
                 each.reports[name].put(text)
@@ -157,7 +201,8 @@ class Publisher:
         """Tell how far the daemon is that starts; a document that is done is the last one."""
         text = document.json_line()
         with self._lock:
-            own = self._machines[document.site, document.machine]
+            if (own := self._machines.get((document.site, document.machine))) is None:
+                return
             own.start = text if document.done < document.total else None
             self._put(START.under(own.site, own.machine), text)
 
@@ -294,19 +339,12 @@ class Publisher:
         stamps = access.stamps()  # before the files are read: a later change shows
         settings, validity = self._settings(access, _Endpoints(listen, endpoints.connect))
         opened = session(listen, endpoints.connect, settings)
-        reports = {
-            name: opened.declare_publisher(
-                REPORT.under(*name),
-                encoding=zenoh.Encoding.APPLICATION_JSON,
-                congestion_control=zenoh.CongestionControl.DROP,
-            )
-            for name in self._machines
-        }
-        declared = tuple(item for each in self._machines.values() for item in self._declared(opened, each))
+        own = _Session(_Endpoints(listen, endpoints.connect), opened, {}, {}, access, stamps)
         with self._lock:
             is_late = self._closing.is_set()
             if not is_late:
-                own = _Session(_Endpoints(listen, endpoints.connect), opened, reports, declared, access, stamps)
+                for each in self._machines.values():
+                    self._declare(own, each)
                 self._sessions += (own,)
         if is_late:
             close_session(opened)
@@ -316,10 +354,21 @@ class Publisher:
 
     def _settings(self, access: Access, endpoints: _Endpoints) -> tuple[Settings, Validity]:
         own = access.zenoh.model_copy(update={"connect": endpoints.connect})
-        prefixes = tuple(each.prefix for each in self._machines.values())
+        prefixes = (ROOT,) if self._of_hall else tuple(each.prefix for each in self._machines.values())
         return replace(access, zenoh=own).settings(prefixes, endpoints.listen)
 
-    def _declared(self, opened: zenoh.Session, own: Published) -> tuple[object, ...]:
+    def _declare(self, within: _Session, own: Published) -> None:
+        """Declare in a session that a machine is alive, what answers queries about it, and its reports."""
+        name = own.site, own.machine
+        report = within.opened.declare_publisher(
+            REPORT.under(*name),
+            encoding=zenoh.Encoding.APPLICATION_JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+        within.reports[name] = report
+        within.declared[name] = (*self._declared(within.opened, own), report)
+
+    def _declared(self, opened: zenoh.Session, own: Published) -> tuple[Declared, ...]:
         """Declare in a session that a machine is alive, and what answers queries about it."""
         keys = {topic: topic.under(own.site, own.machine) for topic in (REPORT, EVENT, START)}
 

@@ -146,9 +146,13 @@ class StartDocument(DocumentModel):
     text: str  # The same in words
 
 
+ROOT = "otolith"
+"""The beginning of all keys."""
+
+
 def prefix(site: str, machine: str) -> str:
     """Return the beginning of all keys of a machine."""
-    return f"otolith/{site}/{machine}"
+    return f"{ROOT}/{site}/{machine}"
 
 
 def _with_timeout(endpoint: str) -> str:

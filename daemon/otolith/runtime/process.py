@@ -131,6 +131,12 @@ class ChildProcess:
         self._inbox: _Inbox | None = None
         self._outbox: queue.Queue[Any] = queue.Queue(room)
 
+    def widen(self, room: int) -> None:
+        """Let up to ``room`` messages wait from now on."""
+        self._room = room
+        with self._outbox.mutex:
+            self._outbox.maxsize = room
+
     def start(self, *arguments: Any) -> None:
         """Spawn the process; messages for an earlier one are dropped. A failure to spawn counts as a death."""
         self._release()

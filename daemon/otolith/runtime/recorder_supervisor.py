@@ -173,6 +173,10 @@ class RecorderSupervisor:
         if self._process.may_restart(now):
             self.start(now)
 
+    def finish(self) -> None:
+        """Record no more; what waits is written."""
+        self._process.finish()
+
     def stop(self, seconds: float) -> None:
         """Let the recorder write what it has for up to ``seconds``."""
         self._whole.stop(seconds)

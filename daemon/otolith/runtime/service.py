@@ -11,7 +11,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,11 +26,11 @@ from otolith.adaptation.state import (
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
 from otolith.health.labels import Numbers, baseline_event, clock_event, expiry_event
-from otolith.health.schema import CountersDocument, EventDocument, Report, ReportDocument
+from otolith.health.schema import CountersDocument, EventDocument, Language, Report, ReportDocument
 from otolith.health.status import driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.health.times import moment_text
-from otolith.machine import LoadedMachine, load_machine
+from otolith.machine import LoadedMachine
 from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import StartDocument
@@ -40,7 +40,7 @@ from otolith.runtime.hall.pool import Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.process import EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.storage.disk import StorageThread
+from otolith.storage.disk import StorageThread, WriterThread
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import history_of
@@ -53,6 +53,7 @@ log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
+LEAVE_FLUSH = 30.0  # s to write what is left of a machine that is served no longer
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
@@ -123,6 +124,15 @@ def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
 
 
 @dataclass(frozen=True, slots=True)
+class Revision:
+    """A changed machine file, with all else that must be read to take it over."""
+
+    change: Reload
+    files: dict[str, str]  # That are kept as evidence
+    decisions: OperatorDecisions
+
+
+@dataclass(frozen=True, slots=True)
 class SharedParts:
     """What the machines of a hall have in common."""
 
@@ -157,6 +167,7 @@ class Service:
         self._noted: tuple[EventDocument, ...] = ()  # events that the next report has
         self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
         self._notes: tuple[str, ...] = ()
+        self._refused = ""  # Why a changed file was not taken over
         self._waiting: tuple[str, ...] = ()  # Parameters whose baselines were found with other values
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
@@ -173,10 +184,24 @@ class Service:
                 writer.share(shared.storage)
 
     @property
+    def path(self) -> Path:
+        """Its machine file."""
+        return self._loaded.path
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Its site and its name."""
+        return self._loaded.file.machine.site, self._loaded.file.machine.name
+
+    @property
+    def language(self) -> Language:
+        """The language of its texts."""
+        return self._loaded.file.machine.language
+
+    @property
     def title(self) -> str:
         """Site and name of the machine, with a point between."""
-        identity = self._loaded.file.machine
-        return f"{identity.site}.{identity.name}"
+        return ".".join(self.names)
 
     @property
     def access(self) -> Access:
@@ -242,6 +267,23 @@ class Service:
         steps.callback(self._evidence.stop, WRITER_FLUSH)
         if self._shared is None:
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
+
+    def end(self) -> None:
+        """End a machine of a hall, in another thread than the main one; then another daemon may serve it."""
+        writers = [writer for writer in (self._writer, self._history, self._evidence) if writer is not None]
+        with contextlib.ExitStack() as steps:
+            steps.callback(self.unlock)
+            steps.callback(self._await, writers)
+            self.stop_outputs(steps)
+            steps.callback(self._recorder.finish)
+            steps.callback(self.close_driver)
+            if self.publisher is not None:
+                steps.callback(self.publisher.remove, *self.names)
+
+    def _await(self, writers: Sequence[WriterThread]) -> None:
+        deadline = time.monotonic() + LEAVE_FLUSH
+        if not all(writer.wait(max(0.0, deadline - time.monotonic())) for writer in writers):
+            log.warning("writing took over %g s: check the disk", LEAVE_FLUSH)
 
     def close_driver(self) -> None:
         """Listen no longer."""
@@ -316,16 +358,24 @@ class Service:
             self.machine.state = replace(state, health=health)
             self._history.start()
 
-    def reload(self) -> None:
-        """Take over limits, rules, recording and access from the machine file; if it is invalid, go on as before."""
-        try:
-            change = reloaded(self._loaded, load_machine(self._loaded.path))
-            files = self._evidence.files if change.needs_restart else files_of(change.machine)
-            decisions = self._store.decisions()
-        except (OtolithError, OSError) as error:
-            log.warning("not reloaded, the daemon goes on as before: %s", "; ".join(str(error).split("\n")))
-            return
-        self._loaded, self._evidence.files = change.machine, files
+    def revision(self, new: LoadedMachine) -> Revision:
+        """Return what its file changes; raise OtolithError or OSError if something else cannot be read.
+
+        Another thread may call it.
+        """
+        change = reloaded(self._loaded, new)
+        files = self._evidence.files if change.needs_restart else files_of(change.machine)
+        return Revision(change, files, self._store.decisions())
+
+    def refuse(self, reason: str) -> None:
+        """Go on as before although the file is wrong, and let the reports say so."""
+        self._refused = f"not reloaded, the daemon goes on as before: {reason}"
+        log.warning("%s", self._refused)
+
+    def take_over(self, revision: Revision) -> None:
+        """Take over limits, rules, recording and access."""
+        change, decisions = revision.change, revision.decisions
+        self._refused, self._loaded, self._evidence.files = "", change.machine, revision.files
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             # The decisions contain the baselines to which limits in percent refer.
@@ -397,7 +447,7 @@ class Service:
         parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(restarts), "driver": driver, "parameters": parameters}
         update["events"] = (*noted, *document.events)
-        update["notes"] = (*self._notes, *filter(None, [warning]))
+        update["notes"] = (*self._notes, *filter(None, [self._refused, warning]))
         document = self.machine.numbers.number(document.model_copy(update=update))
         if self._history is not None:
             self._describe()

@@ -36,6 +36,7 @@ class WriterThread(ABC):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._shared: StorageThread | None = None
         self._is_started = False
+        self._ended = threading.Event()
 
     @property
     def outage(self) -> str:
@@ -69,6 +70,10 @@ class WriterThread(ABC):
             if self._thread.is_alive():
                 log.warning("%s: writing took over %.1f s: check the disk", self._loss, seconds)
 
+    def wait(self, seconds: float) -> bool:
+        """Wait up to ``seconds`` for the last turn after :meth:`stop`; return whether nothing is written any more."""
+        return not self._is_started or self._ended.wait(seconds)
+
     @abstractmethod
     def write(self) -> None:
         """Write what is waiting; after an exception the next call comes ``WRITE_RETRY`` later, or from :meth:`stop`."""
@@ -97,7 +102,9 @@ class WriterThread(ABC):
                 self.fail(error)
             else:
                 self._last_error, self._retry_at = "", 0.0
-        if not is_last:
+        if is_last:
+            self._ended.set()
+        else:
             self.read()
         return is_last
 

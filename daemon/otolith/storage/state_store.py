@@ -413,6 +413,22 @@ class StateWriter(WriterThread):
             log.warning("%s", error)
 
 
+def is_served(site: str, machine: str) -> bool:
+    """Return whether a daemon of this state directory serves a machine."""
+    path = DecisionsFile(state_directory() / COMPONENTS, site, machine).lock_path
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
 def store_of(machine: LoadedMachine, state: Path | None = None) -> StateStore:
     """Return the store of a machine in the state directory ``state``; in that of this user without one."""
     names, folder = machine.file.machine, None if state is None else state / COMPONENTS

@@ -14,6 +14,7 @@ from pathlib import Path
 from otolith_drivers.modbus.client import ConnectionLostError, NoReplyError, ReadOnlyClient
 from otolith_drivers.modbus.options import LineOptions, Table
 
+OWN = frozenset({"pause", "serial", "host", "port"})  # Options of each user; the line is that of _place
 TURN_POLL = 0.05  # s; delay of a stop while a turn is awaited; engineering choice
 
 _lines_lock = threading.Lock()
@@ -23,8 +24,8 @@ _lines: dict[str, "_Line"] = {}  # That are in use
 class _Line:
     """The connection, and whose turn it is."""
 
-    def __init__(self, options: LineOptions) -> None:
-        self.options, self.client, self.is_open = options, ReadOnlyClient(options), False
+    def __init__(self, place: str, options: LineOptions) -> None:
+        self.place, self.options, self.client, self.is_open = place, options, ReadOnlyClient(options), False
         self.users: set[LineUser] = set()
         self._lock = threading.Lock()
         self._waiting: deque[threading.Event] = deque()
@@ -129,8 +130,8 @@ class LineUser:
             line.users.discard(self)
             if line.users:
                 return
-            if _lines.get(_place(line.options)) is line:
-                del _lines[_place(line.options)]
+            if _lines.get(line.place) is line:
+                del _lines[line.place]
             line.close()
 
     def abort(self) -> None:
@@ -144,7 +145,8 @@ class LineUser:
         """Return the line, of which this driver is a user from now on."""
         if self._line is None:
             with _lines_lock:
-                line = _lines.setdefault(_place(self._options), _Line(self._options))
+                place = _place(self._options)
+                line = _lines.setdefault(place, _Line(place, self._options))
                 if differing := _differences(line.options, self._options):
                     text = f"another machine or source uses this line with other options: {differing}"
                     raise ConnectionLostError(text)
@@ -154,13 +156,14 @@ class LineUser:
 
 
 def _place(options: LineOptions) -> str:
-    """Return what identifies the line on this computer."""
+    """Return what identifies the line on this computer, however it is spelled."""
     if options.host is not None:
-        return f"{options.host}:{options.port}"
+        return f"{options.host.lower()}:{options.port}"
     return str(Path(options.serial or "").resolve())
 
 
 def _differences(there: LineOptions, here: LineOptions) -> str:
-    """Return the options in which the users of a line differ; each may have its own pause."""
-    pairs = {name: (getattr(there, name), getattr(here, name)) for name in LineOptions.model_fields if name != "pause"}
+    """Return the options in which the users of a line differ; each may have its own pause, and its own spelling."""
+    names = [name for name in LineOptions.model_fields if name not in OWN]
+    pairs = {name: (getattr(there, name), getattr(here, name)) for name in names}
     return ", ".join(f"{name} {one} there and {other} here" for name, (one, other) in pairs.items() if one != other)

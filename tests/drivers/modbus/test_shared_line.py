@@ -71,6 +71,15 @@ def pump(path: str, device: int, **options: object) -> Listener:
     return Listener(build(Options.model_validate(keys), Setup((signal,), Path(), PERIOD)))
 
 
+def test_two_spellings_of_a_port_are_one_line(tmp_path: Path) -> None:
+    with line_of(2, None) as (path, _), ExitStack() as stack:
+        (tmp_path / "line").symlink_to(path)
+        pumps = [stack.enter_context(pump(str(port), number)) for number, port in ((1, path), (2, tmp_path / "line"))]
+        wait_for(lambda: all(len(each.samples) >= 5 for each in pumps))
+        assert len(_lines) == 1
+    assert not _lines
+
+
 def test_twenty_devices_on_a_line_are_read_at_the_same_rate() -> None:
     with line_of(DEVICES, None) as (path, _), ExitStack() as stack:
         pumps = [stack.enter_context(pump(path, device)) for device in range(1, DEVICES + 1)]

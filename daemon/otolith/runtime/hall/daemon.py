@@ -6,7 +6,8 @@ disk, a command or a subscriber. It waits only for a process that it has killed 
 and commands, each up to its flush time.
 
 In a hall no machine ends the service: one that cannot be opened is left out, and what goes wrong while one is served
-costs its window only. A machine that is alone ends it with the error.
+costs its window only. A machine that is alone ends it with the error. On SIGHUP another thread reads all files again,
+closes what is no longer served and opens what is new, one machine after the other.
 """
 
 import contextlib
@@ -18,14 +19,21 @@ import sqlite3
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from multiprocessing.connection import wait
+from pathlib import Path
 from types import FrameType
 
 from otolith.machine import LoadedMachine
-from otolith.machine_file import ZenohTable
 from otolith.publishing.publisher import Publisher
 from otolith.publishing.zenoh_session import protect_files
 from otolith.runtime.hall.about import about
+from otolith.runtime.hall.background import Background, Then
+from otolith.runtime.hall.changes import Changes, changes_of_hall, changes_of_one
+from otolith.runtime.hall.files import MachineFiles, Refused, one_line
+from otolith.runtime.hall.left_out import LeftOut
 from otolith.runtime.hall.machine import MAX_WAIT, Machine
 from otolith.runtime.hall.notifier import Notifier
 from otolith.runtime.hall.pool import Pool, Preparation
@@ -33,6 +41,7 @@ from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.service import Service, SharedParts
 from otolith.storage.disk import StorageThread
+from otolith.storage.state_store import LockedError
 from otolith_drivers.errors import OtolithError, ServiceError, counted
 
 log = logging.getLogger(__name__)
@@ -48,17 +57,19 @@ STORAGE_FLUSH, STORAGE_FLUSH_OF_MACHINE = 1.5, 0.03  # s to finish writing at th
 class Daemon:
     """Serves machines, or one, from :meth:`run` to the signal that stops it."""
 
-    def __init__(self, services: Sequence[Service], workers: int = 1, shared: SharedParts | None = None) -> None:
-        """Several ``services`` have the parts that are ``shared``; one that is alone has its own."""
+    def __init__(self, services: Sequence[Service], hall: "HallSetup | None" = None) -> None:
+        """Several ``services`` are a ``hall``, which has the parts that they share; one that is alone has its own."""
         self._services = {service.machine: service for service in services}
-        self._shared, self._is_alone = shared, shared is None
-        self._pool = Pool(list(self._services), workers)
+        self._hall, self._is_alone = hall, hall is None
+        self._pool = Pool(list(self._services), 1 if hall is None else min(len(services), hall.workers))
+        self._numbers = count()
         self._due: list[tuple[float, int, Machine]] = []
         self._publishers: list[Publisher] = []
+        self._left_out, self._background = LeftOut(), Background()
         self._notifier = Notifier()
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
-        self._is_reload_due = False
+        self._is_reload_due = self._is_reloading = False
         self._fed_at = self._watchdog_at = self._recorders_at = self._status_at = 0.0
 
     def run(self) -> int:
@@ -76,7 +87,7 @@ class Daemon:
             self._start()
             while self._stop_signal is None:
                 self._step()
-                if self._is_reload_due:
+                if self._is_reload_due and not self._is_reloading:
                     self._reload()
         finally:
             self._stop()
@@ -94,18 +105,15 @@ class Daemon:
         for service in self._served:
             with self._alone_or_left_out(service):
                 service.prepare()
-        for group in _groups(self._served):
-            with self._alone_or_left_out(*group):
-                published = [service.published for service in group]
-                publisher = Publisher(published, group[0].listen, group[0].access)
-                self._publishers.append(publisher)
-                for service in group:
-                    with self._alone_or_left_out(service):
-                        text = service.open(publisher, patiently=not self._is_alone)
+        for service in self._served:
+            with self._alone_or_left_out(service):
+                text = service.open(self._publisher_for(service), patiently=not self._is_alone)
         if not self._services:
             raise ServiceError("no machine can be served: the lines above say why")
-        self._due = [(0.0, number, machine) for number, machine in enumerate(self._services)]
+        self._due = [(0.0, next(self._numbers), machine) for machine in self._services]
         self._pool.start(time.monotonic())
+        if self._hall is not None:
+            self._left_out.replace(self._hall.refused, {service.names for service in self._served}, time.time())
         listening = text if self._is_alone else f"to {counted(len(self._services), 'machine')}"
         self._notifier.send("READY=1", f"STATUS=listening: {listening}", f"MAINPID={os.getpid()}")
 
@@ -115,46 +123,64 @@ class Daemon:
         return list(self._services.values())
 
     @contextlib.contextmanager
-    def _alone_or_left_out(self, *services: Service) -> Iterator[None]:
-        """Leave machines out that cannot be served; the error of a machine that is alone is raised."""
+    def _alone_or_left_out(self, service: Service) -> Iterator[None]:
+        """Leave a machine out that cannot be served; the error of a machine that is alone is raised."""
         try:
-            with about(services[0].title if len(services) == 1 and not self._is_alone else ""):
+            with about("" if self._is_alone else service.title):
                 yield
         except Exception as error:
             if self._is_alone:
                 raise
-            for service in services:
-                self._leave_out(service, error)
+            _log_left_out(service, error)
+            self._withdraw(service, error)
 
-    def _leave_out(self, service: Service, error: Exception) -> None:
-        """Serve a machine no longer: another daemon may, and nothing of it is written any more."""
+    def _withdraw(self, service: Service, error: Exception | None = None) -> None:
+        """Serve a machine no longer: another daemon may, once another thread has closed what it uses.
+
+        Unless another one does already, it is published then that it is not served because of an ``error``.
+        """
+        del self._services[service.machine]
+        self._due = [row for row in self._due if row[2] is not service.machine]
+        heapq.heapify(self._due)
+        self._pool.leave_out(service.machine)
+        self._background.do(partial(self._close, service, error))
+
+    def _close(self, service: Service, error: Exception | None) -> Then | None:
+        """Close what a machine uses, in another thread; return what follows in the main thread."""
         with about(service.title):
-            is_known = isinstance(error, OtolithError | OSError | sqlite3.Error)
-            log.error("not served: %s", error, exc_info=None if is_known else error)
-            del self._services[service.machine]
-            self._due = [row for row in self._due if row[2] is not service.machine]
-            heapq.heapify(self._due)
-            self._pool.leave_out(service.machine)
-            with contextlib.ExitStack() as steps:
-                steps.callback(service.unlock)
-                service.stop_outputs(steps)
-                steps.callback(service.close_driver)
+            service.end()
+        if error is None or isinstance(error, LockedError):
+            return None
+        refused = Refused(service.path, service.names, one_line(error), service.language)
+        return lambda: self._left_out.add(refused, time.time())
+
+    def _publisher_for(self, service: Service) -> Publisher:
+        """Return the session that a machine shares with those that have the same endpoints and readers."""
+        for publisher in self._publishers:
+            if publisher.shares(service.listen, service.access):
+                publisher.add(service.published)
+                return publisher
+        publisher = Publisher([service.published], service.listen, service.access, of_hall=not self._is_alone)
+        self._publishers.append(publisher)
+        return publisher
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""
-        services, count = self._served, len(self._services)
+        services = self._served
+        shared = None if self._hall is None else self._hall.parts
+        flush = STORAGE_FLUSH + STORAGE_FLUSH_OF_MACHINE * len(services)
         with contextlib.ExitStack() as steps:
             for service in services:
                 steps.callback(service.unlock)
             steps.callback(self._notifier.close)
             for publisher in self._publishers:
                 steps.callback(publisher.close)
-            if self._shared is not None:
-                steps.callback(self._shared.storage.stop, STORAGE_FLUSH + STORAGE_FLUSH_OF_MACHINE * count)
+            if shared is not None:
+                steps.callback(shared.storage.stop, flush)
             for service in services:
                 service.stop_outputs(steps)
-            if self._shared is not None:
-                steps.callback(self._shared.recorder.stop, STORAGE_FLUSH + STORAGE_FLUSH_OF_MACHINE * count)
+            if shared is not None:
+                steps.callback(shared.recorder.stop, flush)
             steps.callback(self._pool.kill)
             for service in services:
                 steps.callback(service.close_driver)
@@ -163,18 +189,81 @@ class Daemon:
             self._notifier.send("STOPPING=1")
 
     def _reload(self) -> None:
-        self._is_reload_due = False
-        for service in self._served:
+        self._is_reload_due, self._is_reloading = False, True
+        self._background.do(partial(self._read, self._served))
+
+    def _read(self, served: Sequence[Service]) -> Then:
+        """Read the files again, in another thread; return what follows in the main thread."""
+        try:
+            changes = changes_of_one(served[0]) if self._hall is None else changes_of_hall(served, self._hall.paths)
+        except Exception as error:  # noqa: BLE001 - no file ends the service
+            _log_error("not reloaded, the daemon goes on as before", error)
+            return self._end_reload
+        return partial(self._take_over, changes)
+
+    def _take_over(self, changes: Changes) -> None:
+        served = [service for service in self._served if service not in changes.ended]
+        for service, revision in changes.revised:
             with self._guarded(service, "not reloaded"):
-                service.reload()
+                service.take_over(revision)
+        for service, reason in changes.kept:
+            with self._guarded(service, "not reloaded"):
+                service.refuse(reason)
         for publisher in self._publishers:
-            self._reload_access(publisher, [service for service in self._served if service.publisher is publisher])
+            self._reload_access(publisher, [service for service in served if service.publisher is publisher])
+        new = {(machine.file.machine.site, machine.file.machine.name) for machine in changes.new}
+        self._left_out.replace(changes.refused, new.union(service.names for service in served), time.time())
+        for service in changes.ended:
+            if service.machine in self._services:  # it was not left out meanwhile
+                with about(service.title):
+                    log.info("its file was changed or removed: what it uses is closed")
+                service.save_last()
+                self._withdraw(service)
+        for machine in changes.new:
+            self._background.do(partial(self._open, machine))
+        self._background.do(lambda: self._end_reload)
+
+    def _open(self, machine: LoadedMachine) -> Then | None:
+        """Open a machine, in another thread; return what follows in the main thread."""
+        if self._hall is None:
+            return None
+        service = self._hall.service_of(machine)
+        if isinstance(service, Refused):
+            refused = service
+            return lambda: self._left_out.add(refused, time.time())
+        try:
+            with about(service.title):
+                service.prepare()
+                service.open(self._publisher_for(service), patiently=True)
+        except Exception as error:  # noqa: BLE001 - no machine ends the hall
+            _log_left_out(service, error)
+            return self._close(service, error)
+        return partial(self._serve, service)
+
+    def _serve(self, service: Service) -> None:
+        """Ask a machine that was opened for its windows."""
+        now, most = time.monotonic(), 1 if self._hall is None else self._hall.workers
+        self._services[service.machine] = service
+        heapq.heappush(self._due, (now, next(self._numbers), service.machine))
+        self._pool.add(service.machine, now, most)
+
+    def _end_reload(self) -> None:
+        self._is_reloading = False
+        for publisher in tuple(self._publishers):
+            if publisher.is_idle:
+                self._publishers.remove(publisher)
+                self._background.do(publisher.close)
+        if not self._is_alone:
+            log.info("%d machines are served", len(self._services))
 
     def _reload_access(self, publisher: Publisher, group: Sequence[Service]) -> None:
         """Let a session take over who may read, if all machines that share it say the same."""
-        if len(_groups(group)) == 1:
-            publisher.reload(group[0].access)
-        elif group:
+        if not group:
+            return
+        first = group[0]
+        if all(each.access.zenoh == first.access.zenoh for each in group):
+            publisher.reload(first.access)
+        else:
             names = ", ".join(service.title for service in group)
             log.warning("only a restart takes over who may read, as the files of %s no longer say the same", names)
 
@@ -191,7 +280,10 @@ class Daemon:
             with self._guarded(service):
                 line = service.finish(finished, self._pool.restarts)
                 self._show_status(line, time.monotonic())
+        self._background.finish()
         now = time.monotonic()
+        if (publisher := next((each.publisher for each in self._services.values()), None)) is not None:
+            self._left_out.publish(publisher, now, time.time())
         self._show_preparation()
         if now - self._watchdog_at >= WATCHDOG_INTERVAL:
             self._watchdog_at = now
@@ -258,27 +350,47 @@ class Daemon:
             self._notifier.send("WATCHDOG=1")
 
 
-def _groups(services: Sequence[Service]) -> list[list[Service]]:
-    """Return the services that share a session: those with the same endpoints, readers and certificates."""
-    groups: dict[tuple[object, ...], list[Service]] = {}
-    for service in services:
-        access = service.access
-        table: ZenohTable = access.zenoh
-        key = (service.listen, table.model_dump_json(), str(access.path.parent.absolute()))
-        groups.setdefault(key, []).append(service)
-    return list(groups.values())
+def _log_left_out(service: Service, error: Exception) -> None:
+    with about(service.title):
+        _log_error("not served", error)
 
 
-def hall_of(machines: Sequence[LoadedMachine], listen: tuple[str, ...] | None, workers: int | None) -> Daemon:
-    """Return the hall of several machines; without a number, there are as many ``workers`` as processors."""
-    shared = SharedParts(RecorderProcess(len(machines)), StorageThread())
-    services = []
-    for machine in machines:
+def _log_error(what: str, error: Exception) -> None:
+    is_known = isinstance(error, OtolithError | OSError | sqlite3.Error)
+    log.error("%s: %s", what, one_line(error), exc_info=None if is_known else error)
+
+
+@dataclass(frozen=True, slots=True)
+class HallSetup:
+    """What several machines have in common."""
+
+    paths: tuple[Path, ...]  # Their files, and directories of files
+    listen: tuple[str, ...] | None  # In place of the endpoints of the files
+    workers: int  # Processes that compute, at most
+    parts: SharedParts
+    refused: tuple[Refused, ...] = ()  # At the start
+
+    def service_of(self, machine: LoadedMachine) -> Service | Refused:
+        """Return the service of a machine, or why there is none."""
+        identity = machine.file.machine
         try:
-            services.append(Service(machine, listen, shared=shared))
+            return Service(machine, self.listen, shared=self.parts)
         except (OtolithError, OSError) as error:
             log.error("%s: not served: %s", machine.path, error)  # noqa: TRY400 - a fault of a machine needs no traceback
-    if not services:
+            return Refused(machine.path, (identity.site, identity.name), one_line(error), identity.language)
+
+
+def hall_of(paths: Sequence[Path], files: MachineFiles, listen: tuple[str, ...] | None, workers: int | None) -> Daemon:
+    """Return the hall of several machines; without a number, there are as many ``workers`` as processors.
+
+    Raises:
+        ServiceError: no machine can be served.
+    """
+    parts = SharedParts(RecorderProcess(), StorageThread())
+    hall = HallSetup(tuple(paths), listen, (os.cpu_count() or 1) if workers is None else workers, parts, files.refused)
+    services = [hall.service_of(machine) for machine in files.machines.values()]
+    usable = [service for service in services if isinstance(service, Service)]
+    if not usable:
         raise ServiceError("no machine can be served: the lines above say why")
-    count = min(len(services), os.cpu_count() or 1) if workers is None else workers
-    return Daemon(services, count, shared)
+    refused = (*files.refused, *(service for service in services if isinstance(service, Refused)))
+    return Daemon(usable, replace(hall, refused=refused))

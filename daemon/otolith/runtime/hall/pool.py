@@ -109,7 +109,7 @@ class Pool:
         """``count`` is the number of processes."""
         self._machines = tuple(machines)
         names = (f"otolith-worker{f'-{number}' if count > 1 else ''}" for number in range(1, count + 1))
-        self.workers = tuple(Worker(name) for name in names)
+        self.workers = [Worker(name) for name in names]
         self._queue: deque[Machine] = deque()  # With a window that waits, in the order of their turns
         self.progress = 0
         """Finished windows and compiled kernels."""
@@ -138,6 +138,14 @@ class Pool:
         for worker in self.workers:
             self._start(worker)
             worker.stall.begin(now, worker.process.processor_time)
+
+    def add(self, machine: Machine, now: float, most: int) -> None:
+        """Compute the windows of a further machine, with another worker unless there are ``most``."""
+        self._machines = (*self._machines, machine)
+        if len(self.workers) < min(most, len(self._machines)):
+            self.workers.append(Worker(f"otolith-worker-{len(self.workers) + 1}"))
+            self._start(self.workers[-1])
+            self.workers[-1].stall.begin(now, self.workers[-1].process.processor_time)
 
     def leave_out(self, machine: Machine) -> None:
         """Compute no further window of a machine."""

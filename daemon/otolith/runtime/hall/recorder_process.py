@@ -18,14 +18,21 @@ RECORDER_ROOM = (
 class RecorderProcess:
     """The process. It is started with the first recording, and again when one is started after it has ended."""
 
-    def __init__(self, machines: int = 1) -> None:
-        self.child = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM * machines)
+    def __init__(self) -> None:
+        self.child = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._shares: dict[str, RecorderShare] = {}
+        self._recordings = 0
 
     def share(self, name: str) -> "RecorderShare":
-        """Return the share of the machine with this name."""
+        """Return the share of the machine with this name, in place of one that it had."""
         self._shares[name] = RecorderShare(name, self)
+        self.child.widen(RECORDER_ROOM * len(self._shares))
         return self._shares[name]
+
+    def next_number(self) -> int:
+        """Return the number of a new recording."""
+        self._recordings += 1
+        return self._recordings
 
     def start(self) -> None:
         """Start the process if it does not run."""
@@ -51,6 +58,7 @@ class RecorderShare:
         self._name, self._whole = name, whole
         self._pauses = RestartPauses()
         self._started_at = 0.0
+        self._number = 0  # of the present recording
         self._process_starts = 0  # of the process, when the present recording was started
         self._is_open = False
         self._answers: deque[Any] = deque()
@@ -80,6 +88,7 @@ class RecorderShare:
         """Start a recording."""
         self._whole.start()
         self.starts += 1
+        self._number = self._whole.next_number()
         self._pauses.begin()
         self._started_at, self._process_starts = time.monotonic(), self._whole.child.starts
         self._answers.clear()
@@ -108,7 +117,7 @@ class RecorderShare:
 
     def receive(self, number: int, answer: Any) -> None:
         """Take an answer of the process about the recording with this number."""
-        if number != self.starts:
+        if number != self._number:
             return
         if isinstance(answer, int):
             self._answers.append(answer)
@@ -127,4 +136,4 @@ class RecorderShare:
         self._is_open = False
 
     def _send(self, content: Any) -> bool:
-        return self._whole.child.offer((self._name, self.starts, content))
+        return self._whole.child.offer((self._name, self._number, content))
