@@ -358,7 +358,26 @@ class Publisher:
         return replace(access, zenoh=own).settings(prefixes, endpoints.listen)
 
     def _declare(self, within: _Session, own: Published) -> None:
-        """Declare in a session that a machine is alive, what answers queries about it, and its reports."""
+        """Declare in a session that a machine is alive, what answers queries about it, and its reports.
+
+        Zenoh starts a thread for each queryable, which is a daemon thread if that which declares is one: it would abort
+        the interpreter at its end.
+        """
+        failed = list[Exception]()
+
+        def declare() -> None:
+            try:
+                self._declare_here(within, own)
+            except Exception as error:  # noqa: BLE001 - raised again in the thread that waits for this one
+                failed.append(error)
+
+        thread = threading.Thread(target=declare, name="declare", daemon=False)
+        thread.start()
+        thread.join()
+        for error in failed:
+            raise error
+
+    def _declare_here(self, within: _Session, own: Published) -> None:
         name = own.site, own.machine
         report = within.opened.declare_publisher(
             REPORT.under(*name),
