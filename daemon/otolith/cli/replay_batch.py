@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from otolith.cli.common import progress_line
 from otolith.cli.replay import with_decisions
-from otolith.cli.run import files_in
 from otolith.cli.terminal import echo
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.batch.batch import (
@@ -20,6 +19,7 @@ from otolith.runtime.batch.batch import (
     run_batch,
 )
 from otolith.runtime.batch.outputs import OutputFormat, opened_output
+from otolith.runtime.hall.files import files_in
 from otolith.runtime.segment import first_state
 from otolith.storage.recording_files import recording_file
 from otolith_drivers.base import Sampling
