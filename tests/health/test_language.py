@@ -25,7 +25,8 @@ from otolith.health.schema import LANGUAGES, CountersDocument, Language, ReportD
 from otolith.health.text import announcements, event_text, headline, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
 from otolith.publishing.html_report import html_report
-from otolith.publishing.recorder import blueprint, operator_text, report_text
+from otolith.publishing.recorder import operator_text, report_text
+from otolith.publishing.recording_layout import blueprint
 from otolith.storage.history import SUFFIX, WINDOW, describe_machine
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.base import Sampling

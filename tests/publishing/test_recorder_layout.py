@@ -1,6 +1,7 @@
 """The operator's tab of a recording: in words, as lanes, with limits. Each file has it from its first window on."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from otolith.health.limits import Level, Limit, MonitoredQuantity
 from otolith.health.schema import CrossingDocument, ForecastDocument, Report, ReportDocument
 from otolith.machine import load_machine
 from otolith.publishing.recorder import Recording, limit_lines, near_values, operator_text
+from otolith.publishing.recording_layout import layout_file
 from otolith_drivers.base import Sampling
 from tests.conftest import EXAMPLES
 from tests.publishing.test_events import documents
@@ -99,3 +101,10 @@ def test_a_far_limit_is_shown_to_a_value_near_it() -> None:
     quantity = MonitoredQuantity(nominal=6.5, limits=limits)
     assert near_values(quantity, 6.5) == pytest.approx([6.5, 6.37, math.nan], nan_ok=True)
     assert near_values(quantity, 7.4) == pytest.approx([6.5, 6.37, 8.125])
+
+
+def test_alike_machines_share_a_layout_and_others_have_their_own() -> None:
+    """Rerun keeps threads and memory of each layout that it writes; a hall has hundreds of machines."""
+    machine = load_machine(EXAMPLES / "dc-motor.toml", with_driver=False).recorded(Sampling.TRUE)
+    other = load_machine(EXAMPLES / "pump-vfd.toml", with_driver=False).recorded(Sampling.TRUE)
+    assert layout_file(machine) == layout_file(replace(machine, title="another")) != layout_file(other)

@@ -8,7 +8,6 @@ for a replay; the curves in ``signals`` are for the viewer, and most of the time
 import json
 import math
 import re
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -18,9 +17,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from rerun.blueprint.encodings import TimelineColumn
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.health.limits import Level, MonitoredQuantity
@@ -42,6 +39,7 @@ from otolith.health.text import (
 )
 from otolith.health.times import clock_in, in_local_time, moment_text
 from otolith.machine import RecordedMachine
+from otolith.publishing.recording_layout import APPLICATION, TIMELINE, layout_file, named_with_unit
 from otolith.storage.recording_files import (
     EVENT_MARGIN,
     FILE_MODE,
@@ -51,14 +49,12 @@ from otolith.storage.recording_files import (
     RecordingFolder,
     shortage_of,
 )
-from otolith.twin.definition import Input, Output
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.grammars.markdown import markdown_text
 from otolith_drivers.outside_text import visible
 from otolith_drivers.replay.recording import packed
-from otolith_drivers.units import equation_text, quantity_text, unit_text
+from otolith_drivers.units import equation_text, quantity_text
 
-APPLICATION = "otolith"
 TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
 SAMPLES, LOG, EVENTS, REPORT, OPERATOR = "samples", "log", "events", "report", "operator"  # entities
 Times = NDArray[np.int64]  # ns
@@ -70,7 +66,6 @@ BATCH_WINDOWS, BATCH_SECONDS = 30, 300.0  # windows that are written together, a
 FULL_CURVES = 15  # windows with all records in their curves, at the begin of a file and after a change of an event
 CURVE_BUCKET = 40  # records of which a curve has the smallest and the largest otherwise
 FLUSH_TIMEOUT = 30.0  # s
-TIMELINE = "time"
 NEAR_LIMITS = 3.0  # times the distance of the nearest limit from the nominal value, up to which others are shown
 NEAR_VALUES = 2.0  # times the distance of the value from the nominal value, the same
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
@@ -192,7 +187,6 @@ class Recording:
         self._source = source
         self._stream = rr.RecordingStream(APPLICATION, recording_id=re.sub(r"\W+", "_", source.title))
         self._stream.set_log_time_enabled(False)
-        self._layout = tempfile.TemporaryDirectory(prefix="otolith-")
         self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
         self._limits: dict[str, MonitoredQuantity] = {}
         self._states: dict[str, str] = {}
@@ -205,11 +199,7 @@ class Recording:
         """Finish the present file, and go on in the file ``path``."""
         self.write()
         self._stream.save(path)
-        # Rerun's default_blueprint would keep two threads and 0.5 MB for each file.
-        layout = Path(self._layout.name) / "layout.rbl"
-        if not layout.exists():
-            blueprint(self._source).save(APPLICATION, layout)
-        self._stream.log_file_from_path(layout)
+        self._stream.log_file_from_path(layout_file(self._source))
         self._log_static()
         self.waiting, self._full_curves = 0, FULL_CURVES
         self._written_at = time.monotonic()
@@ -264,7 +254,6 @@ class Recording:
         """Write everything out."""
         self.write()
         self._stream.disconnect()
-        self._layout.cleanup()
 
     def _add_document(self, document: ReportDocument) -> None:
         window = document.window
@@ -420,11 +409,6 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     return [(texts.decimals(text), value, colour) for text, value, colour in shown]
 
 
-def named_with_unit(name: str, unit: str) -> str:
-    """Return the name of a quantity with its unit in brackets, if it has one."""
-    return f"{name} [{symbol}]" if (symbol := unit_text(unit)) else name
-
-
 def near_values(quantity: MonitoredQuantity, value: float) -> list[float]:
     """Return nominal value and limits of a parameter at ``value``; not a number for each that is too far to be shown.
 
@@ -497,76 +481,3 @@ def report_text(document: ReportDocument) -> str:
         ]
     rows += [f"\n{markdown_text(event_text(event, details=True))}" for event in (*current, *document.hints)]
     return texts.decimals("\n".join(rows))
-
-
-def blueprint(source: RecordedMachine) -> rrb.Blueprint:
-    """Return the layout of the viewer."""
-    return rrb.Blueprint(
-        rrb.Tabs(_operator(source), _engineer(source), active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-    )
-
-
-def _operator(source: RecordedMachine) -> rrb.Container:
-    """The state in words and as lanes, each parameter with its limits over the whole recording, and the events."""
-    whole = rrb.TimeAxis(
-        link="Independent",
-        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite()),
-    )
-    texts = source.plan.texts
-    say = texts.translated
-    estimates = [
-        rrb.TimeSeriesView(
-            contents=[f"/parameters/{row.name}", f"/limits/{row.name}"],
-            name=f"{named_with_unit(row.name, row.unit)}: {say(row.meaning)}",
-            axis_x=whole,
-            plot_legend=rrb.PlotLegend(_legend_corner(source.plan.parameters.get(row.name, MonitoredQuantity()))),
-        )
-        for row in source.parameters
-    ]
-    estimates.append(
-        rrb.TimeSeriesView(origin="/components", name=texts("components"), axis_x=whole),
-    )
-    columns = rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow for a date, which the text has
-        text_log_columns=["LogLevel", "Body"],
-    )
-    return rrb.Vertical(
-        rrb.Horizontal(
-            rrb.TextDocumentView(origin="/operator", name=source.title),
-            rrb.StateTimelineView(origin="/state", name=texts("state_over_time"), time_view=whole),
-            column_shares=[1, 1],
-        ),
-        rrb.Grid(*estimates),
-        rrb.TextLogView(origin="/events", name=texts("events"), columns=columns),
-        row_shares=[6, 4, 2],
-        name=texts("state"),
-    )
-
-
-def _legend_corner(quantity: MonitoredQuantity) -> rrb.Corner2D:
-    """Return where the legend hides the healthy value least: on the side of the nearest limit."""
-    nearest = min(quantity.limits, key=lambda row: abs(row.value - quantity.nominal), default=None)
-    return rrb.Corner2D.LeftBottom if nearest is not None and nearest.is_lower else rrb.Corner2D.LeftTop
-
-
-def _engineer(source: RecordedMachine) -> rrb.Container:
-    """Curves of signals and twin, residuals, the report and the log."""
-    series, twin, texts = rrb.TimeSeriesView, source.twin, source.plan.texts
-    signals: tuple[Output | Input, ...] = (*twin.outputs, *twin.inputs)
-    names = {row.name: named_with_unit(texts.translated(row.meaning), row.unit) for row in signals}
-    outputs = [
-        series(origin=f"/signals/{row.name}", name=f"{names[row.name]}: {texts('measured_and_twin')}")
-        for row in twin.outputs
-    ]
-    inputs = [series(origin=f"/signals/{row.name}", name=names[row.name]) for row in twin.inputs]
-    residual = series(origin="/residual", name=texts("residuals"))
-    words = (
-        rrb.TextDocumentView(origin="/report", name=texts("report")),
-        rrb.TextLogView(origin="/log", name=texts("log")),
-    )
-    return rrb.Horizontal(
-        rrb.Vertical(*outputs, *inputs, residual), rrb.Vertical(*words), column_shares=[3, 2], name=texts("curves")
-    )
