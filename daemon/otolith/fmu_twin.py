@@ -8,6 +8,7 @@ own, as in any twin.
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
@@ -45,6 +46,8 @@ class VariableTable(StrictModel):
     bounds: Bounds | None = None  # Of a state; of an input its ordinary range
     measured: bool = True  # Of a state or an output: whether a sensor shows it
     derivative: str | None = None  # Of a position: the name of its speed, a state
+    state: bool | None = None  # Of an FMU that is stepped: whether the future follows from it
+    start: str | None = None  # Of such a state: name in the FMU of the variable that sets its start value
 
 
 _Named = tuple[str, DescribedVariable]  # A variable with its name in the twin
@@ -75,19 +78,21 @@ class _Maker:
     ) -> None:
         self._fmu, self._tables, self._written, self._fail = fmu, tables, parameters, fail
         self._own: dict[str, str] = {}  # Names in the twin by those in the FMU
+        self._states = self._chosen_states()
+        self._rates = fmu.rates or self._states  # Of one that is stepped: the states at the end of a step
         for name, table in tables.items():
             self._claim(name, table)
 
     def definition(self) -> Definition:
         """Return the twin."""
         fmu = self._fmu
-        states = [self._named(name) for name in fmu.states]
+        states = [self._named(name) for name in self._states]
         inputs = [self._named(row.name) for row in fmu.of("input")]
         shown = self._outputs()
         parameters = [self._parameter_variable(name) for name in self._written]
         self._check_sizes({"states": states, "inputs": inputs, "outputs": shown, "parameters": parameters})
         units = {row.name: self._unit(name, row) for name, row in (*states, *inputs, *shown, *parameters)}
-        computed = [pair for pair in shown if pair[1].name not in fmu.states]
+        computed = [pair for pair in shown if pair[1].name not in self._states]
         left = [*(f"der({name})" for name, _ in states), *(name for name, _ in computed)]
         given = [name for name, _ in states] + [f"{ENTERING}{name}" for name, _ in inputs]
         given += [name for name, _ in parameters]
@@ -130,12 +135,12 @@ class _Maker:
             version=fmu.version,
             identifier=fmu.identifier,
             token=fmu.token,
-            states=quantities(states),
+            states=tuple(self._set_by(row, item) for (_, row), item in zip(states, quantities(states), strict=True)),
             inputs=quantities(inputs),
             parameters=quantities(parameters),
             rates=tuple(
                 _quantity(fmu.variables[rate], state.unit or units[state.name])
-                for rate, (_, state) in zip(fmu.rates, states, strict=True)
+                for rate, (_, state) in zip(self._rates, states, strict=True)
             ),
             outputs=quantities(computed),
             integrals=tuple(
@@ -143,7 +148,54 @@ class _Maker:
             ),
             has_slopes=fmu.has_slopes,
             is_model=fmu.is_model,
+            is_stepped=fmu.is_stepped,
+            can_restore=fmu.is_stepped and fmu.has_states,
+            step=fmu.step,
+            own_step=fmu.own_step,
         )
+
+    def _chosen_states(self) -> tuple[str, ...]:
+        """Return the states; of an FMU that is stepped those that the file names, or all with start values."""
+        fmu = self._fmu
+        stated = {table.variable or name: (name, table) for name, table in self._tables.items()}
+        if not fmu.is_stepped:
+            for own, table in stated.values():
+                if table.state is not None or table.start is not None:
+                    self._fail(("twin", "variables", own), "state and start are of an FMU that must make steps")
+            return fmu.states
+        named = tuple(name for name, (_, table) in stated.items() if table.state and name in fmu.variables)
+        left = (name for name in fmu.states if name not in stated or stated[name][1].state is not False)
+        found = named or tuple(left)
+        for name in found:
+            self._check_start(name, *stated.get(name, (name, VariableTable())))
+        if not found:
+            example = 'omega = { variable = "w", state = true, start = "w_start" }'
+            self._fail(
+                ("twin", "fmu"), f"is for co-simulation and does not show its states: write each, like {example}"
+            )
+        return found
+
+    def _check_start(self, name: str, own: str, table: VariableTable) -> None:
+        """Fail if nothing sets the start value of a state of an FMU that is stepped."""
+        setting, key = table.start or name, ("twin", "variables", own)
+        row = self._fmu.variables.get(setting)
+        if row is None:
+            known = nearest(setting, list(self._fmu.variables))
+            self._fail((*key, "start"), f"the FMU has no such real variable: {known}")
+        elif row.causality != "parameter" and row.initial not in ("exact", "approx"):
+            remedy = f'{_identifier(name)} = {{ variable = "{name}", state = true, start = "the_variable" }}'
+            self._fail(key, f"no start value of {setting!r} can be set: write the variable that sets it, like {remedy}")
+
+    def _set_by(self, row: DescribedVariable, state: FmuQuantity) -> FmuQuantity:
+        """Return what sets a state: its own variable, or that of its start value."""
+        table = self._tables.get(self._own[row.name], VariableTable())
+        if table.start is None:
+            return state
+        start = self._fmu.variables[table.start]
+        if start.unit and row.unit and start.unit != row.unit:
+            key = ("twin", "variables", self._own[row.name], "start")
+            self._fail(key, f"{start.name!r} is in {start.unit!r}, but {row.name!r} in {row.unit!r}")
+        return replace(state, reference=start.reference, start=state.start if math.isnan(start.start) else start.start)
 
     def _claim(self, name: str, table: VariableTable) -> None:
         """Give a variable the name of its table."""
@@ -157,7 +209,7 @@ class _Maker:
         except ValueError as error:
             self._fail(at, str(error))
         row = self._fmu.variables[wanted]
-        if row.causality not in ("input", "output", "parameter") and wanted not in self._fmu.states:
+        if row.causality not in ("input", "output", "parameter") and wanted not in self._states:
             self._fail(at, f"{wanted!r} is neither a state nor an input, an output or a parameter of the FMU")
         self._own[wanted] = name
 
@@ -178,6 +230,12 @@ class _Maker:
     def _speeds(self, states: list[str]) -> dict[str, str]:
         """Return the speed of each position, by the left side of its equation: the FMU or a table says so."""
         fmu, found = self._fmu, dict[str, str]()
+        if fmu.is_stepped:
+            for name in states:
+                if self._tables.get(name, VariableTable()).derivative:
+                    key = ("twin", "variables", name, "derivative")
+                    self._fail(key, "the FMU makes steps, so its derivatives are not seen: leave it out")
+            return found
         references = {fmu.variables[state].reference: name for state, name in zip(fmu.states, states, strict=True)}
         for rate, name in zip(fmu.rates, states, strict=True):
             written = self._tables.get(name, VariableTable()).derivative
@@ -196,23 +254,25 @@ class _Maker:
             for variable, own in self._own.items()
             if own in self._tables
             and self._tables[own].measured
-            and (fmu.variables[variable].causality == "output" or variable in fmu.states)
+            and (fmu.variables[variable].causality == "output" or variable in self._states)
         ]
         found = named or [self._named(row.name) for row in fmu.of("output")]
         if not found:
-            example = f'[twin.variables] {_identifier(fmu.states[0])} = "{fmu.states[0]}"'
+            example = f'[twin.variables] {_identifier(self._states[0])} = "{self._states[0]}"'
             self._fail(("twin", "fmu"), f"has no outputs: name the states that sensors show, like {example}")
         return found
 
     def _parameter_variable(self, name: str) -> _Named:
         """Return a parameter of the machine file, and its variable."""
-        tunable = self._fmu.of("parameter", TUNABLE)
+        tunable = self._fmu.of("parameter", TUNABLE, *(() if self._fmu.is_model else ("fixed",)))
         known = {self._own.get(row.name, _identifier(row.name)): row for row in tunable}
         if name not in known:
             fixed = {_identifier(row.name) for row in self._fmu.of("parameter", "fixed")}
             why = "a fixed one, which cannot change while it runs" if name in fixed else nearest(name, list(known))
             self._fail(("parameters", name), f"the FMU has no such tunable parameter: {why}")
         row = known[name]
+        if row.name in {table.start for table in self._tables.values()}:
+            self._fail(("parameters", name), "sets the start value of a state, so it is estimated with each window")
         if self._own.get(row.name, name) != name or (row.name not in self._own and name in self._own.values()):
             self._fail(("parameters", name), "is the name of another variable too: name it in [twin.variables]")
         self._own[row.name] = name

@@ -289,11 +289,16 @@ def _twin(file: MachineFile, path: Path, context: Context) -> Definition:
     if sum(key is not None for key in (file.twin.name, file.twin.file, file.twin.fmu)) != 1:
         choice = 'name = "dc_motor", a twin of the library, or file = "my-twin.toml", or fmu = "motor.fmu"'
         context.fail(("twin",), f"write either {choice}")
-    if file.twin.variables and file.twin.fmu is None:
-        context.fail(("twin", "variables"), "names variables of an FMU: write fmu as well, or leave it out")
+    for key, is_written in (("variables", bool(file.twin.variables)), ("step", file.twin.step is not None)):
+        if is_written and file.twin.fmu is None:
+            context.fail(("twin", key), "is of an FMU: write fmu as well, or leave it out")
     if file.twin.fmu is not None:
         with context.at("twin", "fmu"):
             description = read_fmu(path.parent / file.twin.fmu)
+        if file.twin.step is not None:
+            if not description.is_stepped:
+                context.fail(("twin", "step"), "is of an FMU that must make steps: leave it out")
+            description = replace(description, step=file.twin.step, own_step=file.twin.step)
         bounded = {name: (row.low is not None, row.high is not None) for name, row in file.parameters.items()}
         return twin_of_fmu(description, file.twin.variables, bounded, context.fail)
     if file.twin.file is not None:

@@ -118,6 +118,7 @@ class TwinTable(StrictModel):
     name: str | None = None
     file: Path | None = None
     fmu: Path | None = None
+    step: Annotated[float | None, BeforeValidator(Quantity("s", 1e-6, 10.0))] = None  # Of an FMU that makes steps
     variables: Variables = VARIABLES
 
 

@@ -85,6 +85,16 @@ def only_co_simulation(path: Path) -> Path:
     return described(path, exchange, "")
 
 
+def without_derivatives(path: Path) -> Path:
+    """Return ``path`` for co-simulation alone, without the list of its derivatives: only steps show them."""
+    only_co_simulation(path)
+    text = description_of(path)
+    lists = r"    <Derivatives>.*?</Derivatives>\n|    <ContinuousStateDerivative [^>]*/>\n"
+    changed_text = re.sub(lists, "", text, flags=re.DOTALL)
+    assert changed_text != text
+    return described(path, text, changed_text)
+
+
 def with_line(file: Path, old: str, new: str) -> Path:
     """Return a file in which a text was replaced once."""
     text = file.read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import SourceFile
 from otolith_drivers.errors import ConfigurationError
-from tests.exchange.foreign import exported, machine_text, only_co_simulation, plain, write_machine
+from tests.exchange.foreign import exported, machine_text, only_co_simulation, plain, without_derivatives, write_machine
 from tests.messages import raises_saying
 from tests.simulation.motors import PERIOD
 from tests.variants import often, often_rows
@@ -113,6 +113,13 @@ def test_co_simulation_that_shows_its_derivatives_is_the_same(version: Version, 
     path = tmp_path / "shown.fmu"
     path.write_bytes(plain(version=version))
     assert_same(*both(tmp_path, only_co_simulation(path).read_bytes(), "dc_motor"))
+
+
+@pytest.mark.parametrize("version", often([Version.TWO], Version))
+def test_co_simulation_that_only_makes_steps_is_the_same(version: Version, tmp_path: Path) -> None:
+    path = tmp_path / "steps.fmu"
+    path.write_bytes(plain(version=version))
+    assert_same(*both(tmp_path, without_derivatives(path).read_bytes(), "dc_motor"))
 
 
 DERIVATIVES = """

@@ -27,7 +27,6 @@ from tests.exchange.foreign import (
     described,
     description_of,
     exported,
-    only_co_simulation,
     plain,
     rewritten,
     with_line,
@@ -282,14 +281,6 @@ def test_a_unit_that_is_not_known_is_that_of_its_base_units(file: Path) -> None:
     text = description_of(path).replace('"rad/s"', '"per blink"')
     rewritten(path, lambda name, own: text.encode() if name == DESCRIPTION else own)
     assert loaded(file).twin.unit_of("omega") == "s^(-1)*rad^(1)"
-
-
-def test_co_simulation_that_hides_its_states_is_refused(file: Path) -> None:
-    path = only_co_simulation(file.parent / "motor.fmu")
-    (rates,) = re.findall(r"    <Derivatives>.*?</Derivatives>\n", description_of(path), re.DOTALL)
-    described(path, rates, "")
-    with raises_saying(ConfigurationError, "twin.fmu", "co-simulation only", "states", "export it for model exchange"):
-        loaded(file)
 
 
 # An FMU that does something while it is loaded, or computes what no twin can.

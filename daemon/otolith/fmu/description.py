@@ -16,11 +16,10 @@ from otolith_drivers.units import UnitNameError, base_exponents, to_base
 MAX_TEXT = 120  # characters of a meaning
 SAME_FACTOR = 1e-6  # relative difference up to which two factors of one unit are one
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+CHANGING = ("continuous", "discrete")
 REALS = {"2": ("Real",), "3": ("Float64",)}
-HIDDEN_RATES = (
-    "is for co-simulation only and does not show {what}: estimation needs the derivatives of the states at any "
-    "point, which a step hides: export it for model exchange"
-)
+STEP = 1e-3
+"""Engineering choice, in s: step of a trial of an FMU for co-simulation that states none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +30,7 @@ class DescribedVariable:
     reference: int
     causality: str
     variability: str
+    initial: str  # How its start value is found: "exact" if it can be set
     meaning: str
     unit: str  # As pint reads it; empty if the FMU states none, or one that cannot be read
     unit_fault: str  # Why its unit cannot be used; empty if it can, or if it states none
@@ -51,13 +51,16 @@ class FmuDescription:
     tool: str
     identifier: str
     token: str
-    is_model: bool  # For model exchange; otherwise for co-simulation, with rates that are shown at its start
+    is_model: bool  # For model exchange; otherwise for co-simulation
+    is_stepped: bool  # Whether its rates cannot be read, so that it must make steps
+    step: float  # s: of its steps in a trial
+    own_step: float  # s: it makes steps of whole multiples of it; 0 if of any length
     has_slopes: bool  # Whether it offers directional derivatives
     has_states: bool  # Whether its whole state can be read and set
     indicators: int
     variables: dict[str, DescribedVariable]
-    states: tuple[str, ...]  # In the order of the FMU
-    rates: tuple[str, ...]  # Of the states
+    states: tuple[str, ...]  # In the order of the FMU; of one that is stepped: those whose start values can be set
+    rates: tuple[str, ...]  # Of the states; none of one that is stepped
 
     def of(self, causality: str, *variabilities: str) -> list[DescribedVariable]:
         """Return the variables of a causality, and of some variabilities if they are given."""
@@ -87,16 +90,16 @@ def read_fmu(path: Path) -> FmuDescription:
     states = [rate.derivative for rate in rates]
     if any(state is None for state in states):
         raise ValueError(f"{DESCRIPTION}: one of its derivatives does not say of which state it is")
-    if not states and not is_model:
-        raise ValueError(HIDDEN_RATES.format(what="its states"))
-    if not states:
+    is_stepped = not is_model and not (states and all(row.initial == "exact" for row in states))
+    if is_stepped:
+        rates, states = [], [row for row in variables.values() if row.type in REALS[version] and _can_be_state(row)]
+    if not states and is_model:
         raise ValueError("has no continuous states: a twin is a system of differential equations")
     slopes = (getattr(own, f"providesDirectionalDerivative{ending}", False) for ending in ("", "s"))
     described = {row.name: _described(row, units) for row in variables.values() if row.type in REALS[version]}
     if not all(row.name in described for row in (*states, *rates)):
         raise ValueError(f"{DESCRIPTION}: one of its states is no number of double precision")
-    if not is_model and (fixed := next((row.name for row in states if row.initial != "exact"), "")):
-        raise ValueError(HIDDEN_RATES.format(what=f"{visible(fixed, 80)!r} as a start value"))
+    step, own_step = _steps(model) if is_stepped else (0.0, 0.0)
     return FmuDescription(
         archive=archive,
         version=version,
@@ -106,6 +109,9 @@ def read_fmu(path: Path) -> FmuDescription:
         identifier=str(own.modelIdentifier),
         token=str(model.guid),
         is_model=is_model,
+        is_stepped=is_stepped,
+        step=step,
+        own_step=own_step,
         has_slopes=is_model and any(_is_true(item) for item in slopes),
         has_states=_is_true(own.canGetAndSetFMUstate),
         indicators=int(model.numberOfEventIndicators or 0) if version == "2" else len(model.eventIndicators),
@@ -113,6 +119,20 @@ def read_fmu(path: Path) -> FmuDescription:
         states=tuple(state.name for state in states),
         rates=tuple(rate.name for rate in rates),
     )
+
+
+def _can_be_state(row: Any) -> bool:
+    """Whether a variable may be a state of an FMU that does not say which are: one whose start value can be set."""
+    return row.causality in ("output", "local") and row.initial == "exact" and row.variability in CHANGING
+
+
+def _steps(model: Any) -> tuple[float, float]:
+    """Return the step of a trial and the FMU's own step, both in s."""
+    own, default = model.coSimulation, model.defaultExperiment
+    internal = _number(own.fixedInternalStepSize, 0.0)
+    step = internal or _number(default.stepSize if default else None, 0.0)
+    step = step if 0.0 < step < math.inf else STEP
+    return step, 0.0 if _is_true(own.canHandleVariableCommunicationStepSize) else step
 
 
 def _model(archive: FmuArchive) -> Any:
@@ -147,6 +167,7 @@ def _described(row: Any, units: dict[str, Any]) -> DescribedVariable:
         reference=int(row.valueReference),
         causality=str(row.causality),
         variability=str(row.variability),
+        initial=str(row.initial or ""),
         meaning=_plain(row.description)[:MAX_TEXT],
         unit=unit,
         unit_fault=fault,

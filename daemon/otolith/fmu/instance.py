@@ -36,6 +36,16 @@ OF_MODELS = {
     "3": {calls.GET_RATES: "GetContinuousStateDerivatives", calls.UPDATE: "UpdateDiscreteStates"},
 }
 """C functions by the version of FMI, and by the entry of the table; those below have one name in both versions."""
+OF_STEPPED = {
+    "2": {calls.RESTORE: "SetFMUstate", calls.SET_UP: "SetupExperiment"},
+    "3": {calls.RESTORE: "SetFMUState"},
+}
+OF_ALL_STEPPED = {
+    calls.RESET: "Reset",
+    calls.INITIALISE: "EnterInitializationMode",
+    calls.BEGIN: "ExitInitializationMode",
+    calls.DO_STEP: "DoStep",
+}
 OF_ALL_MODELS = {
     calls.SET_STATES: "SetContinuousStates",
     calls.ENTER_EVENTS: "EnterEventMode",
@@ -48,9 +58,9 @@ Column = NDArray[np.float64]
 class FmuInstance:
     """A model of an FMU that kernels can evaluate."""
 
-    def __init__(self, reference: FmuReference) -> None:
-        """Raise ConfigurationError if the FMU cannot be loaded or refuses to start."""
-        self.reference = reference
+    def __init__(self, reference: FmuReference, start: float = 0.0) -> None:
+        """Raise ConfigurationError if the FMU cannot be loaded or refuses to start, at a time (s)."""
+        self.reference, self._start = reference, start
         self._table = np.zeros(calls.ENTRIES, dtype=np.int64)
         self._buffers: list[NDArray[Any]] = []  # They must live as long as their addresses
         width, height = len(reference.arguments), len(reference.rows)
@@ -68,6 +78,11 @@ class FmuInstance:
             self._table[calls.INSTANCE] = 0  # it may be in a state in which it must not be freed
             text = visible(str(error) or type(error).__name__, MAX_MESSAGE)
             raise ConfigurationError(f"{reference.path}: the FMU does not start: {text}") from error
+
+    @property
+    def _reals(self) -> NDArray[np.float64]:
+        """The table as numbers of double precision."""
+        return self._table.view(np.float64)
 
     @property
     def address(self) -> float:
@@ -96,14 +111,21 @@ class FmuInstance:
                 raise RuntimeError(f"{self.reference.path}: {self._fault}: it must be mended") from error
         self._table[calls.STATUS] = 0
 
-    def rows(self, arguments: Column) -> Column:
+    def rows(
+        self, arguments: Column, length: float | None = None, *, in_a_row: int = 1, is_late: bool = False
+    ) -> Column:
         """Return rates and outputs (records, rows) for states, inputs and parameters (records, arguments).
 
-        Both are in coherent units; NaN where the FMU cannot compute them.
+        Both are in coherent units; NaN where the FMU cannot compute them. Of an FMU that is stepped, rates are the mean
+        ones over ``in_a_row`` steps of a ``length`` (s, by default its own); the outputs are those at the beginning, or
+        if ``is_late`` at the end.
         """
         own = arguments / np.array([item.scale for item in self.reference.arguments])
+        self._reals[calls.LENGTH] = self.reference.step if length is None else length
+        self._table[calls.IN_A_ROW], self._table[calls.IS_LATE] = in_a_row, is_late
         found = np.empty((len(own), len(self.reference.rows)))
         calls.sweep(self._table.ctypes.data, np.ascontiguousarray(own), found)
+        self._table[calls.IN_A_ROW], self._table[calls.IS_LATE] = 1, 0
         self.recover()
         return np.asarray(found * np.array([item.scale for item in self.reference.rows]))
 
@@ -131,12 +153,18 @@ class FmuInstance:
         names = dict(FUNCTIONS[version])
         if reference.is_model:
             names |= OF_MODELS[version] | OF_ALL_MODELS
+        if reference.is_stepped:
+            names |= OF_STEPPED[version] | OF_ALL_STEPPED
         if reference.has_slopes:
             names[calls.SLOPE] = "GetDirectionalDerivative"
         for number, name in names.items():
             function = getattr(self._own.dll, f"fmi{version}{name}")
             table[number] = ctypes.cast(function, ctypes.c_void_p).value or 0
         table[calls.IS_THIRD], table[calls.IS_MODEL] = version == "3", reference.is_model
+        table[calls.IS_STEPPED], table[calls.IN_A_ROW] = reference.is_stepped, 1
+        self._reals[calls.START], self._reals[calls.LENGTH] = self._start, reference.step
+        self._reals[calls.OWN_STEP] = reference.own_step
+        table[calls.END_AT] = self._kept(np.zeros(2 * len(reference.states)))
         groups = (reference.states, reference.inputs, reference.parameters, reference.outputs)
         for number, group in zip((calls.STATES, calls.INPUTS, calls.PARAMETERS, calls.OUTPUTS), groups, strict=True):
             table[number] = len(group)
@@ -156,12 +184,15 @@ class FmuInstance:
 
     def _begin(self) -> None:
         """Instantiate the model and bring it into the mode in which rates are computed."""
-        own = self._own
+        own, is_third = self._own, self.reference.version == "3"
         own.instantiate(**_instantiation(self.reference.version))
-        if self.reference.version == "2":
-            own.setupExperiment(startTime=0.0)
-        own.enterInitializationMode()
+        if not is_third:
+            own.setupExperiment(startTime=self._start)
+        own.enterInitializationMode(**({"startTime": self._start} if is_third else {}))
         self._table[calls.INSTANCE] = ctypes.cast(own.component, ctypes.c_void_p).value or 0
+        self._table[calls.SAVED] = 0
+        if self.reference.can_restore:
+            self._table[calls.SAVED] = own.getFMUState().value or 0
         if not self.reference.is_model:
             return  # the mode in which start values are set, and what follows from them is read
         own.exitInitializationMode()

@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass, field
 
+OF_STEPPED = 1e-4
+"""Of a value or its typical size: step of a central difference of an FMU that is stepped. Theory: near the cube root of
+the error of a solver, 1e-12 of a value."""
+
 
 @dataclass(frozen=True, slots=True)
 class FmuQuantity:
@@ -33,6 +37,12 @@ class FmuReference:
     ] = ()  # Rates that are states, by the numbers of both: the states integrate them
     has_slopes: bool = False  # Whether it offers directional derivatives
     is_model: bool = True  # For model exchange; otherwise for co-simulation, whose rates are those at its start
+    is_stepped: bool = False
+    """For co-simulation, without rates: those are the mean ones over a step, and ``rates`` are the states at its end.
+    Then the references of ``states`` are those of the variables that set their start values."""
+    can_restore: bool = False  # Whether its whole state can be read and set
+    step: float = 0.0  # Of a trial, s, if it is stepped
+    own_step: float = 0.0  # s: it makes steps of whole multiples of it; 0 if of any length
 
     @property
     def arguments(self) -> tuple[FmuQuantity, ...]:

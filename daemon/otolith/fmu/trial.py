@@ -32,6 +32,9 @@ MOVED = 0.1  # of the typical size of each argument: how far the second point is
 LATER = 7.3  # s: another time, at which rates must be the same
 REPEATED = 1e-9  # relative difference up to which two results are the same
 SLOPE_ERROR = 1e-3  # of the largest slope of a row: a directional derivative may differ so much from a difference
+STEPS = 50  # after which an FMU is started anew, and goes on as long, to be compared with one that was not
+STEP_ERROR = 1e-3  # of the change in all of these steps: how much they may differ
+HALF_ERROR = 0.1  # of the largest change in a step: two halves of it may differ so much from it
 EVALUATIONS = 200  # that are timed
 MAX_ANSWER = 1_000_000  # bytes of the result; each state may be the rate of another one
 CHECKED = 0.01  # s: how often it is asked whether the process has ended
@@ -210,9 +213,15 @@ def _trial(reference: FmuReference) -> dict[str, object]:
     if not (np.isfinite(first).all() or np.isfinite(second).all()):
         raise ValueError("the FMU computes no rates, neither from its start values nor near them")
     _compare(reference, first, again, "what it computes depends on what it computed before, so it has no rates")
-    instance.set_time(LATER)
-    _compare(reference, first, instance.rows(start[None])[0], "depends on the time, which no twin may but by inputs")
-    instance.set_time(0.0)
+    if reference.is_stepped:
+        later, tolerance = FmuInstance(reference, LATER).rows(start[None])[0], STEP_ERROR
+    else:
+        instance.set_time(LATER)
+        later, tolerance = instance.rows(start[None])[0], REPEATED
+        instance.set_time(0.0)
+    _compare(reference, first, later, "depends on the time, which no twin may but by inputs", tolerance)
+    if reference.is_stepped:
+        _check_steps(instance, moved)
     if reference.has_slopes:
         _check_slopes(instance, moved if np.isfinite(second).all() else start)
     states = np.array([point[: len(reference.states)] for point in (start, moved)])
@@ -222,15 +231,64 @@ def _trial(reference: FmuReference) -> dict[str, object]:
             fault = f"{reference.rates[rate].name!r} of the FMU is not {reference.states[state].name!r}"
             raise ValueError(f"{fault}: leave its derivative out of [twin.variables]")
     found = np.argwhere(equal[:, : len(states[0])].all(axis=0) & (states[1] != 0.0)).tolist()
+    found = [] if reference.is_stepped else found  # its rates are mean ones over a step
     begun = time.perf_counter()
     instance.rows(np.repeat(moved[None], EVALUATIONS, axis=0))
     return {"seconds": (time.perf_counter() - begun) / EVALUATIONS, "integrals": found}
 
 
-def _compare(reference: FmuReference, one: NDArray[np.float64], other: NDArray[np.float64], fault: str) -> None:
-    same = np.isclose(one, other, rtol=REPEATED, atol=0.0, equal_nan=True)
+def _compare(
+    reference: FmuReference,
+    one: NDArray[np.float64],
+    other: NDArray[np.float64],
+    fault: str,
+    tolerance: float = REPEATED,
+) -> None:
+    same = np.isclose(one, other, rtol=tolerance, atol=0.0, equal_nan=True)
     if not same.all():
         raise ValueError(f"{reference.rows[int(np.argmin(same))].name!r} of the FMU: {fault}")
+
+
+def _check_steps(instance: Any, point: NDArray[np.float64]) -> None:
+    """Raise ValueError if the states at the end of a step do not determine what follows, or if nothing moves."""
+    reference, states = instance.reference, len(instance.reference.states)
+    first = instance.rows(point[None])[0]
+    names = ", ".join(row.name for row in reference.rates)
+    if not first[:states].any():
+        raise ValueError(f"nothing moves in a step of {reference.step:g} s: write step in [twin], or other states")
+    lasting = STEPS * reference.step
+    halfway = _after(point, instance.rows(point[None], in_a_row=STEPS)[0], lasting, states)
+    together = _after(halfway, instance.rows(halfway[None], in_a_row=STEPS)[0], lasting, states)
+    going_on = _after(point, instance.rows(point[None], in_a_row=2 * STEPS)[0], 2.0 * lasting, states)
+    moved = np.abs(going_on - point)[:states]
+    sizes = np.array([row.scale * row.size for row in reference.states])
+    wrong = np.abs(going_on - together)[:states] > STEP_ERROR * np.maximum(moved, MOVED * STEP_ERROR * sizes)
+    if wrong.any():
+        name = reference.rates[int(np.argmax(wrong))].name
+        raise ValueError(
+            f"{name!r} of the FMU does not follow from the start values of {names}: it has other states, or these"
+            " cannot be set: name each in [twin.variables] with state = true"
+        )
+    following = _after(point, first, reference.step, states)
+    shown, late = instance.rows(following[None])[0, states:], instance.rows(point[None], is_late=True)[0, states:]
+    for row, one, other in zip(reference.outputs, shown, late, strict=True):
+        if not abs(one - other) <= STEP_ERROR * max(abs(other), MOVED * row.scale * row.size):
+            values = f"{row.name!r} of the FMU is {one:g} before a step from where it is {other:g} after one"
+            raise ValueError(f"{values}: it comes a step late, or is a state: then name it with state = true")
+    if not reference.own_step:
+        half = _after(point, instance.rows(point[None], 0.5 * reference.step)[0], 0.5 * reference.step, states)
+        both = _after(half, instance.rows(half[None], 0.5 * reference.step)[0], 0.5 * reference.step, states)
+        moved = np.abs(following - point)[:states]
+        if (np.abs(both - following)[:states] > HALF_ERROR * np.maximum(moved, MOVED * STEP_ERROR * sizes)).any():
+            raise ValueError(f"two steps of {0.5 * reference.step:g} s do not lead where one of {reference.step:g} s"
+                             " does: it has a step of its own: write it as step in [twin]")  # fmt: skip
+
+
+def _after(point: NDArray[np.float64], rates: NDArray[np.float64], length: float, states: int) -> NDArray[np.float64]:
+    """Return a point after a step of a length (s), by its mean rates."""
+    following = point.copy()
+    following[:states] += length * rates[:states]
+    return following
 
 
 def _check_slopes(instance: Any, point: NDArray[np.float64]) -> None:

@@ -15,10 +15,11 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
-from otolith.fmu.reference import FmuReference
+from otolith.fmu.reference import OF_STEPPED, FmuReference
 from otolith.twin.components import augmentation_inputs
 from otolith.twin.definition import Definition
 from otolith.twin.symbolic import COMPONENT_SLOPES, FMU_TABLE, component, external, external_slope, system_of
+from otolith_drivers.units import to_base
 
 # Of functions that kernels alone call: code that lets Python and C call them takes a fifth of their compile time.
 INNER = "no_cpython_wrapper=True, no_cfunc_wrapper=True"
@@ -152,6 +153,11 @@ class Stage:
 
 STAGES = (Stage(1, 0.0, "", ""), Stage(2, 0.5, "half", "mid_"), Stage(3, 0.5, "half", "mid_"),
           Stage(4, 1.0, "step", "end_"))  # fmt: skip
+STEPPED = (Stage(1, 0.5, "", "mid_"),)
+"""Of an FMU that is stepped: its rates are the mean ones over the step, with inputs as they are in its middle."""
+
+FROM_CALLS = ("ARGUMENTS_AT", "OF_INPUTS", "OF_PARAMETERS", "OF_STATES", "ROWS_AT", "SLOPES_AT", "differentiate",
+              "entry", "evaluate", "evaluate_outputs", "load_real", "set_length", "store_real")  # fmt: skip
 
 Blocks = dict[str, str | list[str]]  # What fills a template: text within a line, or lines of its own
 
@@ -167,6 +173,9 @@ class KernelCode:
         self.p = [symbol.name for symbol in system.parameters]
         self.settings = [symbol.name for symbol in system.settings]
         self.fmu = definition.fmu
+        self.is_stepped = self.fmu is not None and self.fmu.is_stepped
+        self.stages_of_step = STEPPED if self.is_stepped else STAGES
+        self._differences = _differences(definition, self.x)
         self._from_fmu = [] if self.fmu is None else [FMU_TABLE.name]
         self.y = numbered("y", len(system.outputs))
         self.ramps = [name for name, driven in zip(self.u, definition.inputs, strict=True) if driven.hold == "foh"]
@@ -255,15 +264,21 @@ class KernelCode:
                 f"mid_{u}, end_{u} = {u} + 0.5 * increment_{u}, {u} + increment_{u}" for u in self.ramps
             ],
             "stage_rates": self.stages("rates_", []),
-            "advance_state": [
-                f"{x} += sixth * (k1_{row} + 2.0 * k2_{row} + 2.0 * k3_{row} + k4_{row})"
-                for row, x in enumerate(self.x)
-            ],
+            "set_length": ["set_length(int(fmu), step)"] if self.is_stepped else [],
+            "n_stages": str(len(self.stages_of_step)),
+            "moments": unpacked([f"start + {stage.time} * step" for stage in self.stages_of_step]),
+            "advance_state": [f"{x} += {self._over_step('k', row)}" for row, x in enumerate(self.x)],
             "advance_inputs": [f"{u} = end_{u}" for u in self.ramps],
             "read_next_inputs": [f"w_{index} = inputs[record + 1, {index}]" for index in range(len(self.u))],
             "next_state": [self.advanced(numbered("n", len(self.x)), {})],
             "move_to_next": [f"{x} = n_{row}" for row, x in enumerate(self.x)],
         }  # fmt: skip
+
+    def _over_step(self, rates: str, row: int) -> str:
+        """The change of a state in a step, or of its derivative, by the rates at the stages."""
+        if self.is_stepped:
+            return f"step * {rates}1_{row}"
+        return f"sixth * ({rates}1_{row} + 2.0 * {rates}2_{row} + 2.0 * {rates}3_{row} + {rates}4_{row})"
 
     def _innovations(self) -> list[str]:
         """``e`` is measured minus predicted and ``m`` is 1; both are 0 for a missing measurement, which is NaN."""
@@ -293,7 +308,7 @@ class KernelCode:
     def stages(self, function: str, jacobians: Sequence[tuple[str, SparseJacobian]]) -> list[str]:
         """The four stages of a substep: a call of ``function`` each, for ``k`` and the elements of ``jacobians``."""
         lines = []
-        for stage in STAGES:
+        for stage in self.stages_of_step:
             results = numbered(f"k{stage.number}", len(self.x))
             results += [name for prefix, jacobian in jacobians for name in jacobian.names(f"{prefix}{stage.number}")]
             inputs = [stage.input_prefix + name if name in self.ramps else name for name in self.u]
@@ -309,7 +324,7 @@ class KernelCode:
         """
         states, forced_rows = range(len(self.x)), {row for row, _, _ in forced.named("f")}
         stage_dx = []
-        for stage in STAGES:
+        for stage in self.stages_of_step:
             s = stage.advanced(numbered("s", len(self.x)), "q")
             for row in states:
                 terms = [
@@ -322,9 +337,7 @@ class KernelCode:
         return {
             "read_dx": [f"s_{row} = dx[{row}, column]" for row in states],
             "stage_dx": stage_dx,
-            "advance_dx": [
-                f"dx[{r}, column] = s_{r} + sixth * (q1_{r} + 2.0 * q2_{r} + 2.0 * q3_{r} + q4_{r})" for r in states
-            ],
+            "advance_dx": [f"dx[{r}, column] = s_{r} + {self._over_step('q', r)}" for r in states],
         }
 
     def advanced(self, names: list[str], changed: Mapping[str, str]) -> str:
@@ -338,12 +351,23 @@ class KernelCode:
         lines = []
         for column, x in enumerate(self.x):
             lines += [
-                f"delta = {DIFFERENCE.format(name=x)}",
+                f"delta = {self._differences[column]}",
                 self.advanced(numbered("up", len(self.x)), {x: f"{x} + delta"}),
                 self.advanced(numbered("down", len(self.x)), {x: f"{x} - delta"}),
                 *(f"{element.format(row, column)} = (up_{row} - down_{row}) / (2.0 * delta)" for row in states),
             ]
         return lines
+
+
+def _differences(definition: Definition, states: Sequence[str]) -> list[str]:
+    """Steps of the central differences by each state, in its unit."""
+    if definition.fmu is None or not definition.fmu.is_stepped:
+        return [DIFFERENCE.format(name=name) for name in states]
+    found = [DIFFERENCE.format(name=name) for name in states]
+    for index, item in enumerate(definition.fmu.states):  # angles of components follow
+        size = item.scale * item.size / to_base(definition.states[index].unit)[0]
+        found[index] = f"{OF_STEPPED!r} * max(abs({states[index]}), {size!r})"
+    return found
 
 
 def _with_slopes_of_components(expressions: list[sympy.Expr]) -> tuple[list[str], list[sympy.Expr]]:
@@ -379,7 +403,8 @@ def _with_rows_of_fmu(
         if columns := {int(part.args[1]) for part in own if isinstance(part, external_slope)}:
             lines.append(f"{rows}, {slopes} = fmu_slopes_({_groups(fmu, columns)}, {given_to})")
         else:
-            lines.append(f"{rows} = fmu_rows_({given_to})")
+            needs_rates = any(int(part.args[0]) < len(fmu.rates) for part in own)
+            lines.append(f"{rows} = fmu_{'rows' if needs_rates else 'outputs'}_({given_to})")
         for part in own:
             row = int(part.args[0])
             if isinstance(part, external_slope):
@@ -408,14 +433,18 @@ def _of_fmu(part: sympy.Expr) -> tuple[sympy.Expr, ...]:
 
 
 def functions_of_fmu(fmu: FmuReference) -> list[str]:
-    """``fmu_rows_`` and ``fmu_slopes_``: they set the arguments in the FMU's units and return where the results are."""
-    names = "ARGUMENTS_AT, OF_INPUTS, OF_PARAMETERS, OF_STATES, ROWS_AT, SLOPES_AT, differentiate, entry, evaluate"
-    lines = [f"from otolith.fmu.calls import {names}, load_real, store_real", ""]
+    """Functions that set the arguments in the FMU's units and return where the results are.
+
+    ``fmu_rows_`` computes rates and outputs, ``fmu_slopes_`` also their slopes, and ``fmu_outputs_`` outputs, without
+    the step that the rates of some FMUs need.
+    """
+    lines = [f"from otolith.fmu.calls import {', '.join(FROM_CALLS)}", ""]
     lines += [f"fmu_scale_{row} = {item.scale!r}" for row, item in enumerate(fmu.rows)]
     lines += [f"fmu_share_{column} = {1.0 / item.scale!r}" for column, item in enumerate(fmu.arguments)]
     given = numbered("a", len(fmu.arguments))
     for function, evaluation, results in (
         ("fmu_rows_(", "evaluate(table)", "entry(table, ROWS_AT)"),
+        ("fmu_outputs_(", "evaluate_outputs(table)", "entry(table, ROWS_AT)"),
         ("fmu_slopes_(groups, ", "differentiate(table, groups)", "entry(table, ROWS_AT), entry(table, SLOPES_AT)"),
     ):
         body = ["table = int(fmu)", "arguments = entry(table, ARGUMENTS_AT)"]

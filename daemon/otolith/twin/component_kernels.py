@@ -7,7 +7,7 @@ and ``spread`` score a whole spectrum of curves at the cost of a few. All but ``
 
 import sympy
 
-from otolith.twin.codegen import INNER, PRINTER, STAGES, Blocks, KernelCode, unpacked
+from otolith.twin.codegen import INNER, PRINTER, Blocks, KernelCode, unpacked
 from otolith.twin.components import COMPONENT_FAMILIES, family_code
 from otolith.twin.symbolic import absolute, sign
 
@@ -19,7 +19,7 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain):
     trajectory, transition = np.zeros((records, $n_states)), np.zeros((records, $n_states, $n_states))
     input_now, input_next = np.zeros((2, records, $n_states, $n_sites))
     output, feedthrough = np.zeros((records, $n_outputs, $n_states)), np.zeros((records, $n_outputs, $n_sites))
-    dx, forcing = np.zeros(($n_states, $n_columns)), np.zeros((4, $n_states, $n_columns))
+    dx, forcing = np.zeros(($n_states, $n_columns)), np.zeros(($n_stages, $n_states, $n_columns))
     correct = len(gain) > 0
     $read_parameters
     for record in range(records):
@@ -36,6 +36,7 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain):
         substeps = counts[record]
         step = steps[record] / substeps
         half, sixth = step / 2.0, step / 6.0
+        $set_length
         $input_increments
         for row in range($n_states):
             for column in range($n_columns):
@@ -89,7 +90,7 @@ def linearise(code: KernelCode) -> list[str]:
 def _forcing(code: KernelCode, column_of: dict[int, int]) -> list[str]:
     """F_j of a substep: df/ds at stage j times the share of each record in the input, which is interpolated."""
     lines = []
-    for stage in STAGES:
+    for stage in code.stages_of_step:
         lines.append(f"share = (substep + {stage.time}) / substeps")
         for row, site, f in code.f.named(f"f{stage.number}"):
             element = f"forcing[{stage.number - 1}, {row}, {{}}] = {{}} * {f}"

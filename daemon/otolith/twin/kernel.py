@@ -99,6 +99,16 @@ def _step_ratio(grid: TimeGrid) -> int:
     return 1 << int(np.ceil(np.log2(_longest(grid) / ordinary) - WHOLE))
 
 
+def _refinement(count: int, grid: TimeGrid, own_step: float) -> float:
+    """How many times more substeps come after ``count``; 1 if none do: substeps are whole numbers of ``own_step`` s."""
+    if not own_step:
+        return 2.0
+    whole = round((grid.period or 0.0) / own_step)
+    if abs(whole * own_step - (grid.period or 0.0)) > WHOLE * own_step * max(whole, 1):
+        return 1.0  # between its own steps an FMU is interpolated, once from record to record
+    return next((more / count for more in range(count + 1, whole + 1) if whole % more == 0), 1.0)
+
+
 def _longest(grid: TimeGrid) -> float:
     """Return the longest step between two records, s; any number if there are no two."""
     return float(grid.steps[:-1].max(initial=0.0)) or 1.0
@@ -324,19 +334,27 @@ class Kernel:
         Shapes (parameters,), (states,). From those of ``excitation`` on, steps are halved, which estimates the error
         (Richardson; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.4). ``limit`` is for
         an ordinary step: the longest may have as many more as it is longer, so that the cost is linear in the records.
+        An FMU that is stepped has errors of order 1. If it makes steps of its own, a substep is a whole number of them.
         """
         grid, count = excitation.grid, excitation.substeps
         first, second = parameters[None], initial[None]
         coarse = self.simulate(first, second, excitation)
+        fmu = self.definition.fmu
+        order, own_step = (1, fmu.own_step) if fmu is not None and fmu.is_stepped else (4, 0.0)
         while count < limit or count < limit * _step_ratio(grid):
+            ratio = _refinement(count, grid, own_step)
+            if ratio == 1:
+                break
             inputs, steps, counts, *correction = excitation.arguments
-            fine = self._call("simulate", first, second, inputs, steps, 2 * counts, *correction)
+            more = np.rint(ratio * counts).astype(np.int64)
+            fine = self._call("simulate", first, second, inputs, steps, more, *correction)
             with np.errstate(invalid="ignore"):
-                error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
+                share = ratio**order / (ratio**order - 1.0)
+                error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * share
                 allowed = np.maximum(tolerance, RELATIVE_TOLERANCE * np.abs(fine).max(axis=(0, 1), initial=0.0))
             if (error <= allowed).all():
                 break
-            count *= 2
+            count = round(ratio * count)
             excitation = replace(excitation, substeps=count)
             coarse = fine if grid.period is not None else self.simulate(first, second, excitation)
         return count
@@ -406,7 +424,10 @@ def identity_of(definition: Definition) -> str:
         *(
             ()
             if definition.fmu is None
-            else [[item.scale for item in (*definition.fmu.arguments, *definition.fmu.rows)]]
+            else [
+                [item.scale for item in (*definition.fmu.arguments, *definition.fmu.rows)],
+                [item.size for item in definition.fmu.states] if definition.fmu.is_stepped else [],
+            ]
         ),
     )
     return hashlib.sha256(repr(mathematical).encode()).hexdigest()

@@ -8,7 +8,6 @@ predictor line by line, ``sensitivities.md`` derives the sensitivities, ``innova
 from otolith.twin.codegen import (
     INNER,
     PRINTER,
-    STAGES,
     Blocks,
     KernelCode,
     fill,
@@ -34,6 +33,7 @@ ADVANCE = """
 $decorator
 def advance_(step, substeps, $from_record_to_next):
     half, sixth = step / 2.0, step / 6.0
+    $set_length
     $increments
     for substep in range(substeps):
         $inputs_at_stages
@@ -63,6 +63,7 @@ def simulate(parameters, initial, inputs, steps, counts, measured, gain):
             substeps = counts[record]
             step = steps[record] / substeps
             half, sixth = step / 2.0, step / 6.0
+            $set_length
             $input_increments
             for substep in range(substeps):
                 $inputs_at_stages
@@ -80,6 +81,7 @@ def ensemble(parameters, initial, inputs, following, length, substeps):
     predicted, final = np.empty((particles, $n_outputs)), np.empty((particles, $n_states))
     step = length / substeps
     half, sixth = step / 2.0, step / 6.0
+    $set_length
     for particle in range(particles):
         $read_parameters
         $read_own_inputs
@@ -167,8 +169,8 @@ SENSITIVITIES = """
 def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, before_last, columns):
     records, count = inputs.shape[0], len(columns)
     predicted, dy = np.empty((records, $n_outputs)), np.zeros((records, $n_outputs, count))
-    dx, forcing = np.zeros(($n_states, count)), np.zeros((4, $n_states, count))
-    d, b = np.zeros(($n_outputs, $n_parameters)), np.zeros((4, $n_states, $n_parameters))
+    dx, forcing = np.zeros(($n_states, count)), np.zeros(($n_stages, $n_states, count))
+    d, b = np.zeros(($n_outputs, $n_parameters)), np.zeros(($n_stages, $n_states, $n_parameters))
     for column in range(count):
         if $n_parameters <= columns[column] < $n_constant:
             dx[columns[column] - $n_parameters, column] = 1.0
@@ -192,6 +194,7 @@ def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, be
         substeps = counts[record]
         step = steps[record] / substeps
         half, sixth = step / 2.0, step / 6.0
+        $set_length
         $input_increments
         for substep in range(substeps):
             $inputs_at_stages
@@ -199,15 +202,15 @@ def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, be
             $advance_state
             $store_b
             start = time + substep * step
-            moments = (start + 0.0 * step, start + 0.5 * step, start + 0.5 * step, start + 1.0 * step)
+            moments = $moments
             for column in range(count):
                 parameter = columns[column]
                 if parameter < $n_parameters:
-                    for stage in range(4):
+                    for stage in range($n_stages):
                         for row in range($n_states):
                             forcing[stage, row, column] = b[stage, row, parameter]
                 elif parameter >= $n_constant:
-                    for stage in range(4):
+                    for stage in range($n_stages):
                         for row in range($n_states):
                             forcing[stage, row, column] = moments[stage] * b[stage, row, parameter - $n_constant]
             for column in range(count):
@@ -278,7 +281,7 @@ def _forcing(code: KernelCode) -> Blocks:
     return {
         "store_b": [
             f"b[{stage.number - 1}, {row}, {column}] = {b}"
-            for stage in STAGES
+            for stage in code.stages_of_step
             for row, column, b in code.b.named(f"b{stage.number}")
         ]
     }

@@ -11,6 +11,7 @@ from pathlib import Path
 from otolith.cli.common import progress_line
 from otolith.cli.terminal import echo, echo_json
 from otolith.fmu.description import read_fmu
+from otolith.fmu.reference import FmuReference
 from otolith.fmu_twin import TUNABLE
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
@@ -131,6 +132,15 @@ def equations(twin: Definition) -> list[str]:
     return [f"  {left} = {right}" for left, right in rows]
 
 
+def _of_state(fmu: FmuReference) -> str:
+    """Return how the FMU is brought to the states from which a value is wanted."""
+    if not fmu.is_stepped:
+        return "its state is set for each value, so nothing of it is saved"
+    if fmu.can_restore:
+        return "before each step its state is restored and start values are set"
+    return "its state cannot be restored: it is reset before each step, which begins from a fit of its start values"
+
+
 def of_fmu(machine: LoadedMachine) -> list[str]:
     """Return what the FMU of a twin offers; it is tried before.
 
@@ -142,18 +152,23 @@ def of_fmu(machine: LoadedMachine) -> list[str]:
         return []
     offered = read_fmu(Path(fmu.path))
     kind = "model exchange" if fmu.is_model else "co-simulation, whose derivatives are read at start values"
+    if fmu.is_stepped:
+        steps = f"whole multiples of {fmu.own_step:g} s" if fmu.own_step else "any length"
+        kind = f"co-simulation, which makes steps of {steps}"
     slopes = "its own directional derivatives by states and inputs" if fmu.has_slopes else "central differences"
     took = f"{1e6 * trial.seconds:.2g} µs for each value"
     lines = [
         f"  equations in {Path(fmu.path).name}: FMI {fmu.version}.0, {kind}; {took}",
-        f"  sensitivities by {slopes}; its state is set for each value, so nothing of it is saved",
+        f"  sensitivities by {slopes}; {_of_state(fmu)}",
     ]
     units = twin.units()
     for name, rows in (("states", twin.states), ("inputs", twin.inputs), ("outputs", twin.outputs)):
         lines.append(f"  {name}: {', '.join(f'{row.name} ({units[row.name]})' for row in rows)}")
-    unused = [row.name for row in offered.of("parameter", TUNABLE) if row.name not in {p.name for p in fmu.parameters}]
+    settable = (TUNABLE,) if fmu.is_model else (TUNABLE, "fixed")
+    used = {row.name for row in fmu.parameters}
+    unused = [row.name for row in offered.of("parameter", *settable) if row.name not in used]
     lines += [f"  not used, so they keep their values: {some_names(unused)}"] if unused else []
-    fixed = [row.name for row in offered.of("parameter", "fixed")]
+    fixed = [row.name for row in offered.of("parameter", "fixed")] if fmu.is_model else []
     lines += [f"  fixed, so they cannot be estimated: {some_names(fixed)}"] if fixed else []
     for rate, state in trial.integrals:
         if (rate, state) not in fmu.integrals:
