@@ -27,9 +27,11 @@ from otolith.publishing.zenoh_session import (
     REPORT,
     ROOT,
     START,
+    QueryAnswers,
     StartDocument,
     Topic,
     answer,
+    asks_for_past,
     close_session,
     prefix,
     session,
@@ -125,6 +127,7 @@ class Publisher:
         self._refused = ""  # Why files that were replaced cannot be used
         self._unusable: tuple[object, ...] = ()  # Stamps of the files at the latest look that could not use them
         self._sessions: tuple[_Session, ...] = ()
+        self._answers = QueryAnswers()
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
         self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
         everything = _Endpoints(self._listen, tuple(access.zenoh.connect))
@@ -241,6 +244,7 @@ class Publisher:
         self._closing.set()
         self._wake.set()
         self._thread.join(CLOSE_WAIT)
+        self._answers.close()
         with self._lock:
             sessions, self._sessions = self._sessions, ()
         for each in sessions:
@@ -394,8 +398,11 @@ class Publisher:
         def reply(query: zenoh.Query, topic: Topic, kind: str) -> None:
             with self._lock:
                 latest = {REPORT: own.latest, START: own.start}.get(topic)
+            if topic is not START and asks_for_past(query):
+                self._answers.add(query, partial(answer, key=keys[topic], kind=kind, latest=None, archive=own.archive))
+                return
             with query:
-                answer(query, keys[topic], kind, latest, None if topic is START else own.archive)
+                answer(query, keys[topic], kind, latest, None)
 
         return (
             opened.declare_queryable(keys[REPORT], partial(reply, topic=REPORT, kind="report"), complete=True),

@@ -4,10 +4,12 @@ import json
 import logging
 import math
 import os
+import queue
 import re
 import stat
+import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,7 +33,14 @@ from otolith_drivers.errors import ServiceError
 log = logging.getLogger(__name__)
 
 CLIENT_TIMEOUT = 1000  # ms for a client to connect
-MAX_REPLIES = 1000  # to one query, see docs/reference/thresholds-runtime.md
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MAX_REPLIES = 1000  # to one query
+MAX_QUERIES = 64  # that wait; who asks is told of the others at once that they are refused
+SHARE = 0.25  # of a core that answers may take for long, and ...
+BURST = 1.0  # ... s of it that they may take at once before
+MAX_WAIT = 4.5  # s after which nobody waits for an answer any more
+JOIN = 1.0  # s for the answer that has begun when the daemon ends
+LOG_PAUSE = 60.0  # s between two lines about refused queries
 UNITS = {"u": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _RANGE = re.compile(r"([\[\]])([^\[\]]*)\.\.([^\[\]]*)([\[\]])")
 _NOW = re.compile(r"now\(\s*(?:([+-]?[0-9.]+)\s*(u|ms|s|m|h|d|w|))?\s*\)")
@@ -99,6 +108,11 @@ class Archive(Protocol):
         """
 
 
+def asks_for_past(query: zenoh.Query) -> bool:
+    """Whether a query selects documents of the history, or would if it were well written."""
+    return any(query.parameters.get(name) is not None for name in ("_time", "after", "last"))
+
+
 def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive: Archive | None) -> None:
     """Reply with the selected documents of a ``kind``, oldest first; with the ``latest`` if nothing is selected."""
     try:
@@ -114,6 +128,60 @@ def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive:
         texts = archive.messages(kind, selected.limit, selected.after, selected.start, selected.end)
     for text in texts:
         query.reply(key, text, encoding="application/json")
+
+
+class QueryAnswers:
+    """Answers queries of the history: one at a time, and for a share of the time, so that they delay no report."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[tuple[float, zenoh.Query, Callable[[zenoh.Query], None]]] = queue.Queue(MAX_QUERIES)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="answer-queries", daemon=True)
+        self._told = -LOG_PAUSE
+        self.refused = 0  # Queries, since the start
+        self._thread.start()
+
+    def add(self, asked: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
+        """Have a query answered by ``reply``, or refuse it."""
+        try:
+            self._waiting.put_nowait((time.monotonic(), asked, reply))
+        except queue.Full:
+            self._refuse(asked)
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._stopping.set()
+        self._thread.join(JOIN)
+
+    def _run(self) -> None:
+        credit, since = BURST, time.monotonic()  # s of a core
+        while not self._stopping.is_set():
+            try:
+                arrived, asked, reply = self._waiting.get(timeout=JOIN / 2.0)
+            except queue.Empty:
+                continue
+            now = time.monotonic()
+            credit, since = min(BURST, credit + SHARE * (now - since)), now
+            if now - arrived > MAX_WAIT:
+                self._refuse(asked)
+                continue
+            begun = time.thread_time()
+            try:
+                with asked:
+                    reply(asked)
+            except Exception:  # no query ends the thread
+                log.exception("a query is not answered")
+            credit -= time.thread_time() - begun
+            if credit < 0.0:
+                self._stopping.wait(-credit / SHARE)
+
+    def _refuse(self, asked: zenoh.Query) -> None:
+        self.refused += 1
+        with asked:
+            asked.reply_err("too many queries: ask again later, and for more documents at a time")
+        if (now := time.monotonic()) - self._told >= LOG_PAUSE:
+            self._told = now
+            log.warning("queries of the history come too fast: %d were refused since the start", self.refused)
 
 
 @dataclass(frozen=True, slots=True)
