@@ -177,6 +177,9 @@ def test_a_daemon_that_runs_for_years_warns_of_its_certificate(site: Path, caplo
     tls = TlsTable(ca=Path("ca.crt"), certificate=Path("own.crt"), key=Path("own.key"))
     publisher = Publisher([Published("s", "m")], [endpoint], Access(ZenohTable(tls=tls), site / "machine.toml"))
     try:
+        certificate = publisher.certificate
+        assert certificate is not None
+        assert certificate.until - certificate.since >= timedelta(days=CERTIFICATE_DAYS).total_seconds()
         for days in (0, CERTIFICATE_DAYS - 40):
             publisher.warn_of_expiry(utc_now() + timedelta(days=days))
         assert caplog.text == ""

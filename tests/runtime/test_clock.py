@@ -82,6 +82,7 @@ class Daemons:
     published: list[ReportDocument] = field(default_factory=list)
     cut: list[Window] = field(default_factory=list)
     window: int = 0
+    certificate: None = None
 
     def __post_init__(self) -> None:
         self.service = self._started()

@@ -51,6 +51,7 @@ def test_a_machine_whose_interval_holds_the_median_does_not_differ(sd: float, is
 def test_the_nearest_to_a_limit_and_those_that_differ_are_seen_at_once_and_each_machine_once() -> None:
     knowledge = known(*(6.5 + 0.001 * index for index in range(20)), 4.0)
     html = PAGES.get_template("compare.html").render(
+        certificates=[], versions=[],
         peers=peers(knowledge, START, "en"), poor=[], events=[], first=3, here="compare", language="en", refused={},
         words=words_in("en"), title="Works", time="now", dropped=0,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from benchmarks.browser import Browser, browser, program
 from prometheus_client.parser import text_string_to_metric_families
 
 from otolith.health.limits import Level
-from otolith.health.schema import Status
+from otolith.health.schema import DaemonDocument, Status
 from otolith.publishing.zenoh_session import session
 from otolith.site.app import MAX_QUERY, REFRESH
 from otolith.site.serving.live import MAX_LIVE
@@ -68,7 +68,16 @@ def publish(running: Running) -> None:
     parameter = report_of().parameters["R_a"]
     own = {text: parameter.model_copy(update={"unit": text, "reason": text, "status": Status.HELD}) for text in TEXTS}
     report = report_of(HOSTILE_ONE, end=now, state=Level.WATCH, events=events)
-    hostile.publish(report.model_copy(update={"parameters": own, "twin": TEXTS[8], "notes": tuple(TEXTS)}))
+    hostile.publish(
+        report.model_copy(
+            update={
+                "parameters": own,
+                "twin": TEXTS[8],
+                "daemon": DaemonDocument(version=TEXTS[5]),
+                "notes": tuple(TEXTS),
+            }
+        )
+    )
 
 
 @pytest.fixture(scope="module")

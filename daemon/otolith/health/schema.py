@@ -386,6 +386,20 @@ class CountersDocument(DocumentModel):
     commands_failed: Count = 0  # Events for which on_event failed
 
 
+class CertificateDocument(DocumentModel):
+    """The certificate by which a daemon is recognised over the network."""
+
+    since: float  # Unix seconds: begin of its validity
+    until: float  # Unix seconds: after it nobody can connect
+
+
+class DaemonDocument(DocumentModel):
+    """What is to be known of the daemon beside its machine."""
+
+    version: str  # Of Otolith
+    certificate: CertificateDocument | None = None  # None without endpoints that need one
+
+
 class ReportDocument(DocumentModel):
     """The report of one window."""
 
@@ -409,6 +423,7 @@ class ReportDocument(DocumentModel):
     cost: CostDocument = CostDocument()
     counters: CountersDocument | None = None
     driver: DriverDocument | None = None  # None in a replay
+    daemon: DaemonDocument | None = None  # None in a replay
     notes: tuple[str, ...] = ()  # About the daemon since its start: which saved state it could not use, and why
 
     @property

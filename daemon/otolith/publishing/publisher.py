@@ -17,7 +17,7 @@ from functools import partial
 import zenoh
 
 from otolith.health.labels import expiry_notices
-from otolith.health.schema import ReportDocument
+from otolith.health.schema import CertificateDocument, ReportDocument
 from otolith.health.text import announcements
 from otolith.publishing.zenoh_config import ENCRYPTED, NOTICE_DAYS, Access, Settings, Validity, listening
 from otolith.publishing.zenoh_session import (
@@ -226,6 +226,12 @@ class Publisher:
     def warning(self, now: datetime) -> str:
         """Return that the certificate expires soon or has expired; else an empty text."""
         return self._validity.warning(now)
+
+    @property
+    def certificate(self) -> CertificateDocument | None:
+        """Of its encrypted endpoints; None without one."""
+        end, lifetime = self._validity.end, self._validity.lifetime
+        return None if end is None else CertificateDocument(since=(end - lifetime).timestamp(), until=end.timestamp())
 
     def expiry_notice(self, now: datetime) -> Validity | None:
         """Return the validity of the certificate once after each of its ``notices`` was reached."""

@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from otolith import __version__
 from otolith.adaptation.state import (
     AdaptationState,
     OperatorDecisions,
@@ -26,7 +27,7 @@ from otolith.adaptation.state import (
 from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
 from otolith.health.labels import Numbers, baseline_event, clock_event, expiry_event
-from otolith.health.schema import CountersDocument, EventDocument, Language, Report, ReportDocument
+from otolith.health.schema import CountersDocument, DaemonDocument, EventDocument, Language, Report, ReportDocument
 from otolith.health.status import driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.health.times import moment_text
@@ -447,6 +448,8 @@ class Service:
         parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(restarts), "driver": driver, "parameters": parameters}
         update["events"] = (*noted, *document.events)
+        certificate = None if self.publisher is None else self.publisher.certificate
+        update["daemon"] = DaemonDocument(version=__version__, certificate=certificate)
         update["notes"] = (*self._notes, *filter(None, [self._refused, warning]))
         document = self.machine.numbers.number(document.model_copy(update=update))
         if self._history is not None:

@@ -19,6 +19,7 @@ from otolith.health.schema import LANGUAGES, Language
 from otolith.health.times import moment_text
 from otolith.site.collector import Collector
 from otolith.site.compare import peers, poor_data, week
+from otolith.site.daemons import certificates, own_certificate, versions
 from otolith.site.hall import PAGES, Filter, Hall, Shown
 from otolith.site.metrics import CONTENT_TYPE, Metrics
 from otolith.site.outlets.runner import OutletStatus
@@ -173,9 +174,11 @@ class SitePages:
 
     def _compared(self, language: Language) -> list[bytes]:
         knowledge, zone, now = self._collector.knowledge, self._settings.timezone, time.monotonic()
+        validity, today = own_certificate(self._collector.certificate), time.time()
         with self._collector.lock:
             own = {"peers": peers(knowledge, now, language), "poor": poor_data(knowledge, now, language, zone),
-                   "events": week(knowledge, time.time(), language, zone)}  # fmt: skip
+                   "events": week(knowledge, today, language, zone), "versions": versions(knowledge, language),
+                   "certificates": certificates(knowledge, today, language, zone, validity)}  # fmt: skip
             refused = {reason.value: count for reason, count in knowledge.refused.items()}
         page = PAGES.get_template("compare.html").render(
             own, first=FIRST_PEERS, here="compare", language=language, refused=refused, **self._frame(language)

@@ -41,6 +41,7 @@ class Collector:
         Raises:
             ConfigurationError: a file of the credentials is missing or cannot be used.
         """
+        self.certificate = connection.credentials.certificate  # Of the site
         self.knowledge, self.lock = Knowledge(expected), threading.Lock()
         self.dropped: Counter[str] = Counter()
         limits = {"transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
