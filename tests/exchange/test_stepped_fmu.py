@@ -17,6 +17,7 @@ from otolith.exchange.model_description import Version
 from otolith.fmu.instance import FmuInstance
 from otolith.machine import LoadedMachine, find_twin, load_machine
 from otolith.runtime.fmu_archive import fmu_archive
+from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.errors import ConfigurationError
 from tests.exchange.foreign import machine_text, plain, with_line, without_derivatives
 from tests.exchange.foreign import write_machine as write_own
@@ -205,6 +206,17 @@ def without_derivatives_of(fmu: bytes, folder: Path) -> bytes:
     path = folder / "hidden.fmu"
     path.write_bytes(fmu)
     return without_derivatives(path).read_bytes()
+
+
+def test_many_particles_go_a_record_on_as_one_does(tmp_path: Path) -> None:
+    """The kernel by which a simulation draws."""
+    twin = loaded(written(tmp_path, drive(Version.TWO))).twin
+    kernel, values = kernel_of(twin), np.array([[6.5, 0.00143], [6.0, 0.002]])
+    states, inputs = np.array([[20.0, 0.3], [-5.0, 0.1]]), np.tile([12.0, 0.01], (2, 1))
+    _, final = kernel.ensemble(values, states, inputs, inputs, 0.01, 1)
+    along = kernel.simulate(values, states, Excitation.uniform(np.tile([12.0, 0.01], (2, 1)), 0.01))
+    shown = [[row.name for row in twin.states].index(row.name) for row in twin.outputs]
+    assert final[:, shown] == pytest.approx(along[:, 1], rel=1e-9)
 
 
 def test_a_reset_and_a_restored_state_give_the_same(tmp_path: Path) -> None:

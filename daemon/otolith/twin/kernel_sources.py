@@ -81,9 +81,9 @@ def ensemble(parameters, initial, inputs, following, length, substeps):
     predicted, final = np.empty((particles, $n_outputs)), np.empty((particles, $n_states))
     step = length / substeps
     half, sixth = step / 2.0, step / 6.0
-    $set_length
     for particle in range(particles):
         $read_parameters
+        $set_length
         $read_own_inputs
         $y = outputs_($of_outputs_)
         $store
