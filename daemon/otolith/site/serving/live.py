@@ -49,6 +49,7 @@ class Live(Response):
             known = cards
             for part in grouped([*changes, hall.numbers()]):
                 await send({"type": "http.response.body", "body": part, "more_body": True})
+                await asyncio.sleep(0)  # as for pages
             await asyncio.sleep(TICK)
 
 

@@ -1,5 +1,6 @@
 """Answers in pieces: what many readers get is in memory once, and each has only a few pieces of it in flight."""
 
+import asyncio
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from starlette.responses import Response
@@ -24,6 +25,7 @@ class Pieces(Response):
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
         for part in () if scope["method"] == "HEAD" else grouped(self._content):
             await send({"type": "http.response.body", "body": part, "more_body": True})
+            await asyncio.sleep(0)  # others have their turn, and that the reader has left is seen
         await send({"type": "http.response.body", "body": b""})
 
 
