@@ -9,7 +9,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
 from otolith.health.schema import Report
 from otolith.runtime.hall.machine import Machine, Task, WorkerResult
-from otolith.runtime.hall.pool import WINDOW_TIMEOUT, Pool
+from otolith.runtime.hall.pool import COMPILE_TIMEOUT, WINDOW_TIMEOUT, Pool
 from otolith.runtime.worker import Ready, perform
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.acquisition.series import uncut
@@ -123,6 +123,7 @@ def test_a_window_that_kills_its_workers_costs_that_window_of_that_machine(
     for _ in range(2):
         next(process for process in (one, other) if process.taken[-1][0] is hostile.state).alive = False
         pool.poll(1.0)
+        pool.poll(1.0)  # the new worker is ready
     assert (hostile.missed, well.missed) == (1, 0)
     for process in (one, other):
         if pool.workers[(one, other).index(process)].machine is well:
@@ -187,3 +188,28 @@ def test_a_new_worker_warms_up_for_another_machine_if_the_one_before_died_of_it(
         worker.alive = False
         pool.poll(1.0)
     assert {id(state) for state in worker.started} == {id(machine.state) for machine in machines}
+
+
+def test_no_window_waits_for_a_worker_that_starts_while_another_one_is_ready(
+    hall: Halls, tasks: list[Task], report: Report
+) -> None:
+    pool, (first, second), (one, other) = hall(2, 2)
+    other.alive = False
+    pool.poll(1.0)
+    pool.poll(1.0)
+    other.sent = []
+    pool.workers[1].is_ready = False
+    pool.submit(first, tasks[0], 2.0)
+    pool.submit(second, tasks[0], 2.0)
+    assert (len(one.taken), len(other.taken)) == (1, 0)
+    one.finish(report)
+    assert [machine for machine, _ in pool.poll(3.0)] == [first]
+    assert (len(one.taken), len(other.taken)) == (2, 0)
+    one.finish(report)
+    pool.poll(4.0)
+    pool.workers[1].begin(4.0)
+    pool.workers[1].is_compiling = True
+    pool.poll(3.0 + COMPILE_TIMEOUT + WINDOW_TIMEOUT)
+    assert other.alive
+    pool.poll(5.0 + COMPILE_TIMEOUT + WINDOW_TIMEOUT)
+    assert not other.alive  # it hangs while it starts, although it has no window

@@ -90,11 +90,11 @@ class Worker:
         return WINDOW_TIMEOUT + 2 * longest + (COMPILE_TIMEOUT if self.is_compiling else 0.0)
 
     def hangs(self, now: float) -> bool:
-        """Whether it has computed, or waited for something else than its turn, for longer than allowed."""
-        if self.machine is None:
+        """Whether it has started or computed, or waited for something else than its turn, for longer than allowed."""
+        if self.machine is None and self.is_ready:
             return False
         spent = self._effort.seconds(now, self.process.processor_time)
-        return spent > self.allowed_seconds(self.machine.longest)
+        return spent > self.allowed_seconds(0.0 if self.machine is None else self.machine.longest)
 
     def has_stalled(self, now: float, longest: float) -> bool:
         """Whether its effort since the pool made progress is too long."""
@@ -137,6 +137,7 @@ class Pool:
         """Start the workers."""
         for worker in self.workers:
             self._start(worker)
+            worker.begin(now)
             worker.stall.begin(now, worker.process.processor_time)
 
     def add(self, machine: Machine, now: float, most: int) -> None:
@@ -145,6 +146,7 @@ class Pool:
         if len(self.workers) < min(most, len(self._machines)):
             self.workers.append(Worker(f"otolith-worker-{len(self.workers) + 1}"))
             self._start(self.workers[-1])
+            self.workers[-1].begin(now)
             self.workers[-1].stall.begin(now, self.workers[-1].process.processor_time)
 
     def leave_out(self, machine: Machine) -> None:
@@ -167,9 +169,13 @@ class Pool:
                 self._put_back(worker)
                 if worker.process.may_restart(now):
                     self._start(worker)
-            elif worker.machine is not None and worker.machine.current is not None and worker.hangs(now):
-                what = f"the worker has not finished window {worker.machine.current.index}"
-                seconds = worker.allowed_seconds(worker.machine.longest)
+                    worker.begin(now)
+            elif worker.hangs(now):
+                task, longest = (None, 0.0) if (own := worker.machine) is None else (own.current, own.longest)
+                what = (
+                    "the worker has not started" if task is None else f"the worker has not finished window {task.index}"
+                )
+                seconds = worker.allowed_seconds(longest)
                 log.warning("%s in %.0f s of processor time and waiting, and is killed", what, seconds)
                 self._put_back(worker)
                 worker.process.kill()
@@ -235,7 +241,9 @@ class Pool:
         worker.start(self._machines[number % len(self._machines)].state)
 
     def _dispatch(self, now: float) -> None:
-        for worker in self.workers:
+        """Give windows to workers; while one is ready, none waits for one that starts and may compile for minutes."""
+        ready = [worker for worker in self.workers if worker.is_ready and worker.process.alive]
+        for worker in ready or self.workers:
             if worker.is_free and (machine := self._next()) is not None:
                 worker.take(machine, now)
 
