@@ -12,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.quality import is_of_calendar
 from otolith.acquisition.window import Array, Window
+from otolith.adaptation.open_causes import possible_posteriors
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
@@ -173,8 +174,15 @@ class Twin:
     @property
     def time(self) -> float | None:
         """Unix time of the last record that was learned from, s, or the time in its recording; None without one."""
-        phase = self.posterior.phase
+        phase = self._possible[0][1].phase
         return None if phase is None else self.labels.unix(phase.next_start - self._period)
+
+    @property
+    def _possible(self) -> tuple[tuple[float, Posterior], ...]:
+        """What is known under each cause that is possible, with what a person supposes, and its probability."""
+        if self.learned.test is None:
+            return ((1.0, self.posterior),)
+        return tuple((share, self._supposed_of(each)) for share, each in possible_posteriors(self.learned))
 
     @property
     def _period(self) -> float:
@@ -222,7 +230,7 @@ class Twin:
                 raise ConfigurationError(f"no value of {item.label} in the history at {when}: {remedy}")
             sd, trend = 0.5 * (sample.high - sample.low) / QUANTILE, len(problem.free) + index
             posterior = posterior.reset_value(index, sample.last, sd).reset_value(trend, 0.0, float(prior.sd[trend]))
-        learned = replace(self.learned, posterior=posterior)
+        learned = replace(self.learned, posterior=posterior, test=None)
         return replace(self, learned=learned, posterior=posterior, supposed=(*self.supposed, f"values of {when}"))
 
     def with_value(self, name: str, value: str | float) -> "Twin":
@@ -314,36 +322,37 @@ class Twin:
 
     def simulate_along(self, source: PlannedRows | RecordedStretch, *, seed: int = 1) -> Prediction:
         """Return the same as :meth:`simulate` for inputs that were read; raises as it."""
-        posterior = self.posterior
+        possible = self._possible
+        phase = possible[0][1].phase
         try:
             if isinstance(source, PlannedRows):
-                phase = posterior.phase
                 start = 0.0 if phase is None else phase.next_start - self._period
                 window = planned_window(self.machine.twin, source.times, source.columns, self._period, start)
-                prediction, begin = simulate(posterior, window, seed), float(source.times[0])
+                prediction, begin = simulate(possible, window, seed), float(source.times[0])
             else:
-                posterior, window, begin = self._after_lead(source)
-                prediction = simulate(posterior, window, seed)
+                possible, window, begin = self._after_lead(source)
+                prediction = simulate(possible, window, seed)
         except ValueError as error:
-            remedy = "run the daemon, or adapt the twin to a recording" if posterior.phase is None else "see its values"
+            remedy = "run the daemon, or adapt the twin to a recording" if phase is None else "see its values"
             raise ConfigurationError(f"{source.path}: {error}: {remedy}") from error
         return replace(prediction, start=begin)
 
-    def _after_lead(self, stretch: RecordedStretch) -> tuple[Posterior, Window, float]:
-        """Return the posterior after the first usable window of a recording, the rest, and the time of its begin.
+    def _after_lead(self, stretch: RecordedStretch) -> tuple[tuple[tuple[float, Posterior], ...], Window, float]:
+        """Return what is possible after the first usable window of a recording, the rest, and the time of its begin.
 
         What a person supposes holds in the rest only. A recording that is not after what was learned counts as if it
         were: phases of components are then unknown before the first window.
         """
-        known, first = self.learned.posterior, stretch.windows[0]
-        end = known.belief.end
+        possible, first = possible_posteriors(self.learned), stretch.windows[0]
+        end = max(known.belief.end for _, known in possible)
         by = -self.labels.ahead(end) if np.isfinite(end) else 0.0
         if np.isfinite(end) and first.start + by < end - 0.5 * first.sample_period:
             by = end + first.grid.length - first.start
         windows = [replace(window, start=window.start + by) for window in stretch.windows]
         lead = stretch.lead()
         rest = joined([windows[lead].since(windows[lead].records - 1), *windows[lead + 1 :]])
-        return self._supposed_of(after_window(known, windows[lead])), rest, rest.start - by
+        after = tuple((share, self._supposed_of(after_window(known, windows[lead]))) for share, known in possible)
+        return after, rest, rest.start - by
 
     def _supposed_of(self, posterior: Posterior) -> Posterior:
         """Return a later posterior of the same machine with what a person supposes."""

@@ -11,6 +11,7 @@ from benchmarks.changes.plants import Change, Plant
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
+from otolith.adaptation.open_causes import possible_posteriors
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.machine import load_machine
 from otolith.simulation.plan import planned_window
@@ -144,3 +145,24 @@ def test_what_follows_a_change_of_a_parameter_is_predicted(name: str, run: int) 
     window = Window.whole(0, 0.0, plant.period, windows[0].signals, values)
     predicted = simulate(state.posterior, window)
     assert_predicts(predicted, predicted.measured, case.problem.noise)
+
+
+@pytest.mark.parametrize("name", ["winding", "friction"])
+def test_while_causes_are_open_the_bands_hold_what_each_of_them_predicts(name: str) -> None:
+    """After the window that shows the change, which the filter has not learned from."""
+    plant, change, free, at = FAULTS[name]
+    case = Case(name, plant, change, free, healthy=at, changed=11)
+    (windows,) = recordings(case, case.problem, [0], 1)
+    state = initial_state(name, "bench", case.problem)
+    for window in windows[: at + 1]:
+        state, _ = adapt(state, window)
+    assert state.test is not None
+    possible = possible_posteriors(state)
+    assert sum(share for share, _ in possible) == pytest.approx(1.0)
+    values = np.concatenate([windows[at].values[-1:], *(window.values for window in windows[at + 1 :])])
+    window = Window.whole(0, 0.0, plant.period, windows[0].signals, values)
+    by_all, by_filter = simulate(possible, window), simulate(state.posterior, window)
+    assert (held(by_all, by_all.measured) >= LEAST).all()
+    assert (held(by_filter, by_filter.measured) < 0.5).all()
+    alone = simulate([(1.0, state.posterior)], window)
+    assert (alone.values == by_filter.values).all()

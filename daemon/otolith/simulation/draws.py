@@ -6,6 +6,7 @@ Draws come in pairs with opposite deviations, so that their median is that of th
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
 from otolith.estimation.imm_filter import TREND_NOISE, process_model
@@ -19,6 +20,12 @@ PAIRS = 200  # Of draws: the ends of a band are exact to 5 % of its width. docs/
 def opposite(deviates: Array) -> Array:
     """Return ``deviates`` (pairs, ...), and their negatives after them."""
     return np.concatenate([deviates, -deviates])
+
+
+def chosen(weights: Array, pairs: int) -> NDArray[np.int64]:
+    """Return the index (pairs,) of one of several distributions for each pair, as often as ``weights`` say."""
+    shares = (np.arange(pairs) + 0.5) / pairs
+    return np.minimum(np.searchsorted(np.cumsum(weights), shares), len(weights) - 1)
 
 
 def root_of(covariance: Array) -> Array:
@@ -37,16 +44,15 @@ class ParameterDraws:
     _bounds: tuple[Array, Array]
 
     @classmethod
-    def of(cls, posterior: Posterior, random: np.random.Generator) -> "ParameterDraws":
-        """Draw from ``posterior``: a mode of the filter by its probability, then values and trends in it.
+    def of(cls, posterior: Posterior, random: np.random.Generator, pairs: int = PAIRS) -> "ParameterDraws":
+        """Draw ``pairs`` from ``posterior``: a mode of the filter by its probability, then values and trends in it.
 
         Phases and inner parameters of components have no trend here: a phase is what the frequency makes of it.
         """
         problem, belief = posterior.problem, posterior.belief
         free, size = len(problem.free), np.concatenate([problem.scale, problem.scale])
-        shares = (np.arange(PAIRS) + 0.5) / PAIRS
-        mode = np.minimum(np.searchsorted(np.cumsum(belief.weight), shares), len(belief.weight) - 1)
-        deviates = random.standard_normal((PAIRS, 2 * free))
+        mode = chosen(belief.weight, pairs)
+        deviates = random.standard_normal((pairs, 2 * free))
         deviations = np.einsum("pij,pj->pi", root_of(belief.covariance)[mode], deviates)
         drawn = (np.tile(belief.mean[mode], (2, 1)) + opposite(deviations)) * size
         noise = np.tile(TREND_NOISE[belief.level[mode]], (2, 1)) * problem.scale
@@ -65,9 +71,10 @@ class ParameterDraws:
         """
         (_, run), (_, fade) = process_model(seconds)[0]
         root = root_of(process_model(seconds)[1])
-        deviates = opposite(random.standard_normal((PAIRS, self.values.shape[1], 2)) @ root.T)
+        pairs = len(self.values) // 2
+        deviates = opposite(random.standard_normal((pairs, self.values.shape[1], 2)) @ root.T)
         noise = self._trend_noise[..., None] * deviates
-        goes_on = np.tile(np.arange(PAIRS) % 2 == 1, 2)[:, None]
+        goes_on = np.tile(np.arange(pairs) % 2 == 1, 2)[:, None]
         moved = self.values + np.where(goes_on, seconds, run) * self._trends + noise[..., 0]
         self._trends = np.where(goes_on, 1.0, fade) * self._trends + noise[..., 1]
         self.values = np.clip(moved, *self._bounds)
