@@ -24,12 +24,14 @@ NO_LIMITS = QualityLimits(missing=1.0, gap=600.0, jitter=10.0, surplus=1.0, irre
 Samples = tuple[SignalPlan, Array]
 
 
-def quality_of(*signals: Samples, limits: QualityLimits | None = None, begin: float = 0.0) -> Quality:
-    """Return the quality of the second window, which begins 2 s after ``begin``."""
+def quality_of(
+    *signals: Samples, limits: QualityLimits | None = None, begin: float = 0.0, length: float = LENGTH
+) -> Quality:
+    """Return the quality of the second window, which begins ``length`` (s), that of a window, after ``begin``."""
     rings = Rings([plan.name for plan, _ in signals], 4000)
-    windower = Windower([plan for plan, _ in signals], RECORDS, PERIOD, limits)
+    windower = Windower([plan for plan, _ in signals], round(length / PERIOD), PERIOD, limits)
     rings.deliver_columns({plan.name: (times + begin, np.sin(times)) for plan, times in signals})
-    assert windower.begin(rings, begin + 3.0 * LENGTH, 3.0 * LENGTH)
+    assert windower.begin(rings, begin + 3.0 * length, 3.0 * length)
     cut_next(windower, rings)
     return cut_next(windower, rings).quality
 
@@ -129,20 +131,27 @@ def test_gap_limit_is_the_only_bound_of_a_gap(sampling: Sampling, start: float, 
             assert quality.reasons[0].startswith(expected)
 
 
-@pytest.mark.parametrize("jitter", [0.004, 0.099])
-def test_jitter_limit_is_the_only_bound_of_jitter(jitter: float) -> None:
-    """Root mean square lateness: bursts, so that no sample comes later than its window waits."""
-    period = 0.01 if jitter < 0.01 else 0.5
-    times = ramp(round(3.0 * LENGTH / period)) * period
+@pytest.mark.parametrize(("period", "jitter"), [(0.01, 0.004), (0.5, 0.04), (0.5, 0.099)])
+def test_jitter_limit_is_the_only_bound_of_jitter(period: float, jitter: float) -> None:
+    """Root mean square lateness: bursts, so that no sample comes later than its window waits.
+
+    Windows have samples enough to show a period. 0.04 s are a multiple of that of the grid: true times are on it then.
+    """
+    length = max(LENGTH, 20.0 * period)
+    times = ramp(round(3.0 * length / period)) * period
     late = np.zeros(len(times))
     late[1::2] = jitter
-    limits = replace(NO_LIMITS, jitter=0.1)
-    assert quality_of(output(times + late, Sampling.CYCLIC), limits=limits).verdict is Verdict.GOOD
-    strict = quality_of(output(times + late, Sampling.CYCLIC), limits=replace(limits, jitter=0.3 * jitter))
-    assert strict.verdict is Verdict.BAD
-    assert "y arrives with" in strict.reasons[0]
-    assert "more than jitter_limit" in strict.reasons[0]
-    assert quality_of(output(times + late, Sampling.TRUE), limits=replace(limits, jitter=0.0)).verdict is Verdict.GOOD
+    arrivals = times + late
+    with_a_loss = np.delete(arrivals, len(times) // 2)
+    limits, strict = replace(NO_LIMITS, jitter=0.1), replace(NO_LIMITS, jitter=0.3 * jitter)
+    assert quality_of(output(with_a_loss, Sampling.CYCLIC), limits=limits, length=length).verdict is Verdict.GOOD
+    refused = quality_of(output(with_a_loss, Sampling.CYCLIC), limits=strict, length=length)
+    assert refused.verdict is Verdict.BAD
+    assert "y arrives with" in refused.reasons[0]
+    assert "more than jitter_limit" in refused.reasons[0]
+    assert quality_of(output(arrivals, Sampling.CYCLIC), limits=strict, length=length).verdict is Verdict.GOOD
+    no_jitter = replace(limits, jitter=0.0)
+    assert quality_of(output(with_a_loss, Sampling.TRUE), limits=no_jitter, length=length).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize("surplus", [3, 15])

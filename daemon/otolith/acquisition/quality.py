@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from otolith.acquisition.samples import CyclicSeries, SignalPlan
+from otolith.acquisition.samples import EARLY, LOST_INTERVAL, MIN_CLOCK_SAMPLES, CyclicSeries, SignalPlan
 from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict, runs_of
 
 if TYPE_CHECKING:  # slow to import
@@ -27,7 +27,7 @@ class QualityLimits:
 
     missing: float = 1.0  # Share of the records of the grid without a sample, 0 to 1
     gap: float = np.inf  # Longest time without a sample, s
-    jitter: float = 0.005  # Root mean square lateness of a cyclic signal, s
+    jitter: float = 0.005  # Root mean square lateness of a cyclic signal of which samples are lost, s
     surplus: float = 0.02  # Share of samples of a cyclic signal for which there is no slot: a second sender
     irregularity: float = 0.3  # Standard deviation of the interval of a cyclic signal over its mean: a second sender
     same_time: float = 0.25  # Share of samples with time but not value of another: a coarse clock, or two machines
@@ -80,7 +80,11 @@ def assess_quality(
             "or raise same_time_limit ({2:.0%})",
         ),
         *_beyond(
-            {name: 1e3 * jitter for name, jitter in jitters.items()},
+            {
+                name: 1e3 * jitter
+                for name, jitter in jitters.items()
+                if plans[name].is_cyclic and not _is_whole(cyclic[name], span)
+            },
             1e3 * limits.jitter,
             "{0} arrives with {1:.3g} ms of jitter, more than jitter_limit ({2:.3g} ms)",
         ),
@@ -93,6 +97,16 @@ def assess_quality(
         skew=max(offsets) - min(offsets) if offsets else 0.0,
         reasons=tuple(reasons),
     )
+
+
+def _is_whole(signal: CyclicSeries, span: GridSpan) -> bool:
+    """Whether each slot of a signal in the window has a sample: their order then tells the slots of late ones too."""
+    times = signal.series.within(span.start - EARLY * span.period, span.end - EARLY * span.period).times
+    if signal.surplus or len(times) < MIN_CLOCK_SAMPLES:
+        return False
+    steps = np.diff(times)
+    longest = max(float(steps.max()), float(times[0]) - span.start, span.end - float(times[-1]))
+    return longest < LOST_INTERVAL * float(steps.min())
 
 
 def _useless(
