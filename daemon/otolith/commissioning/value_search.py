@@ -9,7 +9,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.commissioning.constancy import ValueChange
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
-from otolith.commissioning.shared_fit import DETERMINED, SharedFit, deviations, size_of
+from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult, gauss_newton
@@ -27,6 +27,7 @@ MAX_QUIET_COST = 1.5  # RMSE of that fit over the noise, up to which the twin ha
 DIFFERENT = 4.0  # standard deviations between the values of both fits, beyond which noise does not explain it
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
 MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
+WIDER_INTERVAL = 1.5  # times the interval of a parameter that is less than determined: accepted in the next fits
 PHASES = 8  # of a sine that are tried in each window
 
 
@@ -107,6 +108,7 @@ class ValueSearch:
         self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
         self._fixed: dict[str, str] = {}  # Not determined, and why
         self._equal: dict[str, str] = {}  # Taken as equal to another one
+        self._rough: dict[str, float] = {}  # What the interval of one is compared with where the example is excluded
         self._last: _Fitted | None = None
 
     def run(self) -> OwnValues:
@@ -208,7 +210,11 @@ class ValueSearch:
         return shared
 
     def _hold(self, weakest: Sequence[str], values: Mapping[str, float], sd: Mapping[str, float]) -> None:
-        """Take one of the parameters that only together are determined as equal to another one, or as stated."""
+        """Take one of the parameters that only together are determined as equal to another one, or as stated.
+
+        A single one that is certainly not as stated keeps its wider interval: held there, it would bias all others. How
+        far it is off does not show beside others that are held.
+        """
         parameters = self._problem.free
         for name in weakest:
             mine = parameters[self._places[name]]
@@ -218,6 +224,10 @@ class ValueSearch:
                     self._equal[name] = other
                     return
         first, *others = weakest
+        is_alone = not others and not self._fixed and first not in self._rough
+        if is_alone and self._excludes_example(first, values[first], sd[first]):
+            self._rough[first] = WIDER_INTERVAL * QUANTILE * sd[first] / DETERMINED
+            return
         remark = f"not determined beside {', '.join(others)}" if others else "the data do not show it"
         self._fixed[first] = remark
         for name in [name for name, other in self._equal.items() if other == first]:
@@ -303,8 +313,15 @@ class ValueSearch:
         values = {row.name: float(value) for row, value in zip(problem.free, guess, strict=False)}
         return np.array([values.get(row.name, row.nominal) for row in self._problem.free])
 
+    def _excludes_example(self, name: str, value: float, sd: float) -> bool:
+        """Whether the data show that a parameter does not have the value of the example, by whatever scale."""
+        row = self._problem.free[self._places[name]]
+        scale, far = SharedScale(row), DIFFERENT * sd
+        number = scale.inside(value)
+        return abs(value - row.nominal) > far and abs(number - scale.inside(row.nominal)) > far / scale.slope(number)
+
     def _size(self, name: str, value: float) -> float:
-        return size_of(self._problem.free[self._places[name]], value)
+        return max(size_of(self._problem.free[self._places[name]], value), self._rough.get(name, 0.0))
 
     def _nominal(self, name: str) -> float:
         return self._problem.free[self._places[name]].nominal
