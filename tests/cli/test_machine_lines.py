@@ -43,6 +43,15 @@ def test_a_new_key_is_the_last_of_its_table_and_a_new_table_the_last_of_the_file
     assert text.endswith('i = "5 mA"\nomega = "1 rad/s"\n\n[process_noise]\ni = "1 A/s^0.5"\n')
 
 
+@pytest.mark.parametrize("keys", ['i = "5 mA"\n', "# none is known\n", ""])
+def test_a_new_key_stands_above_the_comment_of_the_next_table(keys: str) -> None:
+    below = '\n## one estimate for each\n[window]\nlength = "2 s"\n\n## also without a key\n# [swarm]\n# seed = 1\n'
+    text = f"[noise]\n{keys}{below}"
+    assert with_keys(text, "noise", {"i": NewLine("1 A"), "omega": NewLine("1 rad/s")}).endswith(f'"1 rad/s"\n{below}')
+    seconds = with_keys(text, "window", {"sample_period": NewLine("10 ms")}).partition('length = "2 s"\n')[2]
+    assert seconds.startswith('sample_period = "10 ms"\n\n##')
+
+
 @pytest.mark.parametrize("table", ["noise", "process_noise"])
 def test_without_a_key_the_file_stays_as_it_is(table: str) -> None:
     for text in (TEXT, TEXT.replace('i = "5 mA"\n', ""), TEXT.partition("[noise]")[0]):

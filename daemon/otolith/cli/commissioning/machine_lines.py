@@ -133,8 +133,7 @@ def _with_key(rows: list[str], table: str, name: str, line: NewLine) -> list[str
         return [*rows[:number], _line(name, line, comment) + end_of_line, *rows[number + 1 :]]
     if default:
         return [*rows[: default[0]], new, *rows[default[0] + 1 :]]
-    filled = [number for number in places if rows[number].strip()]
-    end = (filled[-1] if filled else places.start - 1) + 1
+    end = _end_of_keys(rows, places)
     return [*rows[:end], new, *rows[end:]]
 
 
@@ -191,6 +190,14 @@ def _inside(rows: list[str], table: str) -> "range | None":
             end = headers[place + 1][0] if place + 1 < len(headers) else len(rows)
             return range(number + 1, end)
     return None
+
+
+def _end_of_keys(rows: list[str], places: range) -> int:
+    """Return the number of the line behind the last key of a table; comments below may be about the next one."""
+    keys = [number for number in places if rows[number].strip() and not rows[number].lstrip().startswith("#")]
+    if keys:
+        return keys[-1] + 1
+    return next((number for number in places if not rows[number].strip()), places.stop)
 
 
 def _is_key(row: str, name: str) -> bool:
