@@ -137,3 +137,19 @@ def test_machines_that_share_a_line_or_a_channel_go_on(own_machine: OwnMachine, 
             assert driver.up, driver.reason
             assert counters is not None
             assert counters.reconnects == 0
+
+
+def test_all_machines_of_a_hall_may_change_at_once(folder: Path) -> None:
+    for name in ("two", "three"):
+        (folder / f"{name}.toml").unlink()
+    hall = RunningHall(folder)
+    try:
+        hall.have(1, "one")
+        write(folder, "one", **{"[driver]": '[window]\nlength = "3 s"\n[driver]'})
+        hall.reload(DONE)
+        hall.have(2, "one")
+        assert follow(hall.reports["one"])
+        window = hall.reports["one"][-1].window
+        assert window.end - window.start > 2.5
+    finally:
+        hall.close()

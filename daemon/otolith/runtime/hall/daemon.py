@@ -270,10 +270,11 @@ class Daemon:
     def _step(self) -> None:
         """Hand the samples of due windows to workers, publish finished reports, supervise the processes."""
         now = time.monotonic()
-        while self._due[0][0] <= now:
+        while self._due and self._due[0][0] <= now:
             _, number, machine = heapq.heappop(self._due)
             heapq.heappush(self._due, (self._take_due(machine, now), number, machine))
-        wait(self._pool.waitables, timeout=min(MAX_WAIT, self._due[0][0] - now))
+        due = self._due[0][0] if self._due else now + MAX_WAIT  # all may begin anew at once
+        wait(self._pool.waitables, timeout=min(MAX_WAIT, due - now))
         for machine, finished in self._pool.poll(time.monotonic()):
             if (service := self._services.get(machine)) is None:
                 continue
@@ -296,7 +297,7 @@ class Daemon:
                 if service.locked_out is not None:
                     with self._alone_or_left_out(service):
                         raise service.locked_out
-            if not self._services:
+            if not (self._services or self._is_reloading):
                 raise ServiceError("no machine is served any more: the lines above say why")
 
     def _take_due(self, machine: Machine, now: float) -> float:

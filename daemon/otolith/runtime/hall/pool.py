@@ -167,7 +167,7 @@ class Pool:
         for worker in self.workers:
             if not worker.process.alive:
                 self._put_back(worker)
-                if worker.process.may_restart(now):
+                if self._machines and worker.process.may_restart(now):
                     self._start(worker)
                     worker.begin(now)
             elif worker.hangs(now):
@@ -188,7 +188,7 @@ class Pool:
             self._seen = self.progress
             for worker in self.workers:
                 worker.stall.begin(now, worker.process.processor_time)
-        longest = max(machine.windower.length for machine in self._machines)
+        longest = max((machine.windower.length for machine in self._machines), default=0.0)
         stalled = [worker.has_stalled(now, longest) for worker in self.workers]  # each counts its effort
         return all(stalled)
 
