@@ -123,6 +123,26 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)
 
 
+def test_a_decision_during_a_reload_is_not_undone(tmp_path: Path) -> None:
+    """The files of a large hall are read for seconds: a baseline that is found meanwhile still counts afterwards."""
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
+    path = tmp_path / "motor.toml"
+    path.write_text(text, encoding="utf-8")
+    service = Service(load_machine(path))
+    service.machine.begin(0.0)
+    store = store_of(service._loaded)
+    path.write_text(text.replace('"+65 %"', '"+80 %"'), encoding="utf-8")
+    revision = service.revision(load_machine(path))
+    store.operator.write(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
+    service._writer.read()
+    service.take(1.0)
+    service.take_over(revision)
+    limited = service.machine.next_state().plan.parameters["R_a"]
+    assert (limited.nominal, limited.has_baseline) == (6.1, True)
+    assert max(limit.value for limit in limited.limits) == pytest.approx(1.8 * 6.1)
+
+
 def test_a_baseline_of_other_values_waits_for_a_restart_and_is_a_hint(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

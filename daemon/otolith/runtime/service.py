@@ -131,6 +131,7 @@ class Revision:
     change: Reload
     files: dict[str, str]  # That are kept as evidence
     decisions: OperatorDecisions
+    before: OperatorDecisions | None  # Those that the service had taken last when these were read
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +170,7 @@ class Service:
         self._failing: dict[str, float] = {}  # outputs, and since when they fail, monotonic s
         self._notes: tuple[str, ...] = ()
         self._refused = ""  # Why a changed file was not taken over
+        self._decisions: OperatorDecisions | None = None  # The last ones that were changed while it runs
         self._waiting: tuple[str, ...] = ()  # Parameters whose baselines were found with other values
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
@@ -364,9 +366,9 @@ class Service:
 
         Another thread may call it.
         """
-        change = reloaded(self._loaded, new)
+        before, change = self._decisions, reloaded(self._loaded, new)
         files = self._evidence.files if change.needs_restart else files_of(change.machine)
-        return Revision(change, files, self._store.decisions())
+        return Revision(change, files, self._store.decisions(), before)
 
     def refuse(self, reason: str) -> None:
         """Go on as before although the file is wrong, and let the reports say so."""
@@ -376,6 +378,8 @@ class Service:
     def take_over(self, revision: Revision) -> None:
         """Take over limits, rules, recording and access."""
         change, decisions = revision.change, revision.decisions
+        if self._decisions is not None and self._decisions is not revision.before:
+            decisions = self._decisions  # They were changed after those of the revision were read
         self._refused, self._loaded, self._evidence.files = "", change.machine, revision.files
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
@@ -402,6 +406,7 @@ class Service:
         self.machine.adopt_period(link.period, window, period)
         decisions = self._writer.new_decisions()
         if decisions is not None:
+            self._decisions = decisions
             self.machine.revise(lambda state: self._decided(state, decisions))
         return Task(raw, link, self._outages(now))
 
