@@ -30,6 +30,7 @@ class Played:
     def __init__(self, steps: Playing) -> None:
         self.steps = steps
         self.ended = threading.Event()
+        self.is_hastened = False  # since its last step was begun
 
 
 class _Player:
@@ -55,6 +56,7 @@ class _Player:
     def hasten(self, played: Played) -> None:
         """Step a recording at once: something has changed for it."""
         with self._changed:
+            played.is_hastened = True
             self._due = [(0.0 if row[2] is played else row[0], *row[1:]) for row in self._due]
             heapq.heapify(self._due)
             self._changed.notify()
@@ -70,6 +72,7 @@ class _Player:
                 played.ended.set()
                 continue
             with self._changed:
+                due = 0.0 if played.is_hastened else due
                 heapq.heappush(self._due, (due, next(self._numbers), played))
 
     def _next(self) -> Played | None:
@@ -83,7 +86,9 @@ class _Player:
                     return None
                 wait = self._due[0][0] - time.monotonic()
                 if wait <= 0.0:
-                    return heapq.heappop(self._due)[2]
+                    played = heapq.heappop(self._due)[2]
+                    played.is_hastened = False
+                    return played
                 self._changed.wait(wait)
 
 
