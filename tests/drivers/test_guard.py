@@ -202,6 +202,33 @@ def test_a_call_that_blocks_is_waited_for_once_and_then_a_defect(method: str, mo
         wait_for(lambda: not events(use_all(machine)))
 
 
+def test_a_thread_that_ends_its_call_late_does_not_end_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The outcome of a call can be taken before its thread says that it has returned."""
+    held, told = threading.Event(), threading.Event()
+
+    class Late(threading.Event):
+        def set(self) -> None:
+            if not told.is_set():
+                told.set()
+                held.wait(PATIENCE)
+            super().set()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading, "Event", Late)
+        call = guard._Call("link()")
+        with pytest.raises(TimeoutError):
+            call.run(lambda: told.wait(0.1) or 1, 0.01)
+        wait_for(told.is_set)
+    assert call.run(lambda: 0, PATIENCE) == 1
+
+    def last() -> int:
+        held.set()
+        time.sleep(0.1)
+        return 2
+
+    assert call.run(last, PATIENCE) == 2
+
+
 def test_open_that_blocks_keeps_nobody_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard, "OPEN_TIMEOUT", 0.01)
     held = threading.Event()

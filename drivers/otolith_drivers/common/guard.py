@@ -79,7 +79,6 @@ class _Call:
         """``title`` names the method in a defect."""
         self._title = title
         self._begun: float | None = None  # s; None if no call is under way
-        self._returned = threading.Event()
         self._outcome: tuple[Any, Exception | None] | None = None
 
     def run(self, method: Callable[[], Any], timeout: float) -> Any:
@@ -91,10 +90,9 @@ class _Call:
             _DefectError: it raises anything else, or takes too long.
         """
         if self._begun is None:
-            self._begun, self._outcome = time.monotonic(), None
-            self._returned.clear()
-            _Caller.make(partial(self._run, method))
-            self._returned.wait(timeout)
+            self._begun, self._outcome, returned = time.monotonic(), None, threading.Event()
+            _Caller.make(partial(self._run, method, returned))
+            returned.wait(timeout)
         if self._outcome is None:
             if (waited := time.monotonic() - self._begun) > STUCK:
                 raise _DefectError(f"{self._title} has not returned for {waited:.0f} s")
@@ -105,14 +103,14 @@ class _Call:
             raise error
         return answer
 
-    def _run(self, method: Callable[[], Any]) -> None:
+    def _run(self, method: Callable[[], Any], returned: threading.Event) -> None:
         try:
             self._outcome = method(), None
         except (OtolithError, _DefectError) as error:
             self._outcome = None, error
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything, also SystemExit
             self._outcome = None, _DefectError(f"{self._title} raises {_named(error)}")
-        self._returned.set()
+        returned.set()
 
 
 class GuardedSource:
