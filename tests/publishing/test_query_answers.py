@@ -94,3 +94,17 @@ def test_a_query_that_cannot_be_answered_ends_no_other(answers: QueryAnswers) ->
     ask(answers, lambda: 1 / 0)
     asked = ask(answers, lambda: None)
     wait_for(lambda: asked.is_answered)
+
+
+def test_a_refusal_that_fails_ends_no_other_answer(answers: QueryAnswers, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_session, "MAX_WAIT", -1.0)  # all have waited for too long
+
+    class Gone(Query):
+        def reply_err(self, text: str) -> None:
+            raise RuntimeError(text)
+
+    gone, following = Gone(), Query()
+    answers.add(cast("Any", gone), lambda _: None)
+    answers.add(cast("Any", following), lambda _: None)
+    wait_for(lambda: bool(following.error))
+    assert gone.is_over

@@ -162,11 +162,11 @@ class QueryAnswers:
                 continue
             now = time.monotonic()
             credit, since = min(BURST, credit + SHARE * (now - since)), now
-            if now - arrived > MAX_WAIT:
-                self._refuse(asked)
-                continue
             begun = time.thread_time()
             try:
+                if now - arrived > MAX_WAIT:
+                    self._refuse(asked)
+                    continue
                 with asked:
                     reply(asked)
             except Exception:  # no query ends the thread
