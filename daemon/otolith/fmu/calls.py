@@ -181,11 +181,15 @@ def restored(table: int) -> int:
 
 @njit(error_model="numpy")
 def made_step(table: int, begin: float, length: float) -> int:
-    """Let the FMU make one step from ``begin`` on, both in s; return its status, REFUSED if it ends before."""
+    """Let the FMU make one step from ``begin`` on, both in s; return its status, REFUSED if it ends before.
+
+    It is told that it may forget what lies before, unless it is brought back there by its saved state.
+    """
     instance, event, function = entry(table, INSTANCE), entry(table, EVENT_AT), entry(table, DO_STEP)
+    may_forget = 0 if entry(table, SAVED) else 1
     if not entry(table, IS_THIRD):
-        return call(function, (instance, begin, length, 1))  # type: ignore[no-any-return]
-    given = (instance, begin, length, 1, event, event + 1, event + 2, event + NEXT_TIME)
+        return call(function, (instance, begin, length, may_forget))  # type: ignore[no-any-return]
+    given = (instance, begin, length, may_forget, event, event + 1, event + 2, event + NEXT_TIME)
     status = call(function, given)
     if status < REFUSED and (load_byte(event + 1) or load_byte(event + 2)):
         return REFUSED
