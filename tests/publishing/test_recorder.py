@@ -14,13 +14,15 @@ from hypothesis import strategies as st
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
 from otolith.machine import LoadedMachine, load_machine
+from otolith.publishing.recorder import Recording
 from otolith.runtime.replay import open_recorded
+from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import recording as recording_module
 from otolith_drivers.replay.recording import RecordingReader
 from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
-from tests.messages import assert_refuses, raises_saying
+from tests.messages import assert_each_says, assert_refuses, raises_saying
 from tests.variants import often
 
 UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}
@@ -310,3 +312,19 @@ def test_the_recorder_does_without_pandas(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("None\n", "")
     assert (tmp_path / "run.rrd").stat().st_size > 0
+
+
+def test_a_recording_without_a_window_yet_is_not_said_to_lack_a_signal(tmp_path: Path, machine: LoadedMachine) -> None:
+    """A daemon that began less than a minute ago has written what the records will mean, and none of them."""
+    path, still_open = tmp_path / "run.rrd", tmp_path / "open.rrd"
+    recording = Recording(path, machine.recorded(Sampling.TRUE))
+    recording.close()
+    whole = path.read_bytes()
+    still_open.write_bytes(whole[: whole.rindex(b"RRF2")])  # without the footer
+    for file, state in ((path, "ended"), (still_open, "minutes")):
+        with pytest.raises(ConfigurationError) as refused:
+            RecordingReader(file, UNITS)
+        assert_each_says([str(refused.value)], (file.name, "window", state))
+        assert "V_a" not in str(refused.value)
+    with raises_saying(ConfigurationError, "'p' (Pa)", "T_load, V_a, i, omega"):
+        RecordingReader(path, {"p": "Pa"})

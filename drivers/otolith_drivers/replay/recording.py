@@ -212,7 +212,10 @@ class RecordingReader(Reader):
 
     def _scale(self, name: str, unit: str, written: Mapping[str, str]) -> tuple[float, float]:
         """Scale and offset from the recorded unit of a signal, in ``written``, to ``unit``."""
-        if name not in written or not self._waiting:
+        if name in written and not self._waiting:
+            when = "its daemon ended before the first one" if self._closed else "some minutes are written at a time"
+            raise ConfigurationError(f"{self.path}: no window is in it: {when}")
+        if name not in written:
             others = [other for other in written if other not in self._units]
             known = nearest(name, others) if others else f"it has {', '.join(sorted(written)) or 'none'}"
             raise ConfigurationError(f"{self.path}: no signal {name!r} ({unit}) was recorded: {known}")
