@@ -90,4 +90,7 @@ def test_a_machine_of_incomplete_data_is_named_with_its_reason() -> None:
     assert [(row.machine.name, row.missing, row.reason) for row in rows] == [
         ("m-1", "40%", "omega: 40% missing"), ("m-2", "0%", "no frame for 5 s"),
     ]  # fmt: skip
+    twice = {"window": window.model_copy(update={"quality": bad.model_copy(update={"reasons": ("no frame for 5 s",)})})}
+    knowledge.take(*sent(report_of("m-2", 3).model_copy(update=down | twice)), START)
+    assert [row.reason for row in poor_data(knowledge, START, "en", None)] == ["omega: 40% missing", "no frame for 5 s"]
     assert poor_data(knowledge, START + 3600.0, "en", None) == []  # silent: nothing is known of its data

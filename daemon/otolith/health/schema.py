@@ -427,6 +427,11 @@ class ReportDocument(DocumentModel):
     notes: tuple[str, ...] = ()  # About the daemon since its start: which saved state it could not use, and why
 
     @property
+    def is_left_out(self) -> bool:
+        """Whether the machine is not served: its report has no number and no twin, and says why."""
+        return self.sequence is None and not self.twin
+
+    @property
     def open_events(self) -> tuple[EventDocument, ...]:
         """The events that are not cleared, without hints; most severe first."""
         return tuple(event for event in self.events if event.end is None and not event.is_hint)

@@ -109,7 +109,7 @@ def _pattern(phrase: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)
 
 
-SENTENCES = ("colder", "trend", "moved", "limit", "component", "returns", "lost",
+SENTENCES = ("not_served", "colder", "trend", "moved", "limit", "component", "returns", "lost",
              "changed", "not_yet", "no_longer", "no_baseline", "no_temperature", "class_in_words")  # fmt: skip
 """Texts of reports, by which a sentence in one language becomes one in another."""
 INNER = {"side": ("below", "above", "still_near"), "beside": ("beside",), "change": ("of_baseline", "at_temperature"),

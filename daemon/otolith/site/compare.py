@@ -68,7 +68,7 @@ def poor_data(knowledge: Knowledge, now: float, language: Language, zone: str | 
         reasons = [*quality.reasons, *([] if driver is None or driver.up else [driver.reason])]
         if quality.verdict is Verdict.BAD or reasons:
             own_zone = zone or zone_of(report)
-            written = (in_local_time(say.translated(reason), own_zone) for reason in reasons)
+            written = (in_local_time(say.translated(reason), own_zone) for reason in dict.fromkeys(reasons))
             words = visible(say.decimals("; ".join(written)))
             missing = say.decimals(f"{quality.missing:.0%}")
             verdict = say.translated(quality.verdict)

@@ -18,6 +18,8 @@ from hypothesis import strategies as st
 
 from otolith.health.limits import Level
 from otolith.health.text import event_in
+from otolith.runtime.hall.files import Refused
+from otolith.runtime.hall.left_out import left_out_report
 from otolith.site.known import Knowledge
 from otolith.site.outlets import mail
 from otolith.site.outlets import notices as notices_module
@@ -29,7 +31,7 @@ from tests.hostile import hostile_text
 from tests.messages import assert_says
 from tests.sites.machines import raised, report_of, sent
 from tests.sites.outlets.rigs import MailRig, WebhookRig
-from tests.storage.histories import START
+from tests.storage.histories import MACHINE, SITE, START
 
 LEVELS = (Level.WATCH, Level.ACT)
 TLS = ssl.create_default_context()
@@ -95,6 +97,23 @@ def test_a_machine_that_was_named_and_never_reports_is_told_and_one_that_is_forg
     assert silences(silent, knowledge, START) == []
     assert silences(silent, knowledge, START + LASTING) == [("press-3", Told.RAISED)]
     assert silences(silent, Knowledge(), START + LASTING) == silences(silent, Knowledge(), START + 2 * LASTING) == []
+
+
+def test_a_machine_that_its_daemon_does_not_serve_is_told_with_the_reason() -> None:
+    """Its reports come, and say nothing else."""
+    knowledge, silent, told = Knowledge(), Silences(), list[Notice]()
+    refused = Refused(Path("press-3.toml"), (SITE, MACHINE), "press-3.toml: R_a", "de")
+    for index in range(300):
+        now = START + index
+        if index < 150 and index % 10 == 0:
+            knowledge.take(*sent(left_out_report(refused, START, now)), now)
+        elif index >= 150 and index % 2 == 0:
+            knowledge.take(*sent(report_of(number=index, end=now)), now)
+        told += silent.take(knowledge, now, now, "en")
+    assert [each.told for each in told] == [Told.RAISED, Told.CLEARED]
+    event = told[0].event
+    assert (event.condition, event.text) == ("not monitored", "not served: press-3.toml: R_a")
+    assert (event.state, event.language, event.since) == (Level.NO_DATA, "en", START)
 
 
 def test_a_link_that_is_cut_leaves_room_for_what_machines_report() -> None:

@@ -10,7 +10,7 @@ from itertools import islice
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, EvidenceDocument, Language
-from otolith.health.text import texts_in
+from otolith.health.text import report_in, texts_in
 from otolith.site.known import KnownMachine
 from otolith.site.outlets.base import Notice, Told
 from otolith.site.words import words_in
@@ -76,7 +76,10 @@ def _told(before: Level | None, state: Level | None, *, is_new: bool) -> Told | 
 
 
 class Silences:
-    """Finds machines of which no reports come, and those that are heard again, each once it lasts."""
+    """Finds machines of which no reports come, or only that they are not served; and when they come again.
+
+    Each is told once it lasts.
+    """
 
     def __init__(self) -> None:
         self._since: dict[tuple[str, str], float] = {}  # When a machine became other than what was told of it
@@ -96,10 +99,12 @@ class Silences:
         self, key: tuple[str, str], machine: KnownMachine, now: float, wall: float, language: Language | None
     ) -> Notice | None:
         told = self._told.get(key)
-        if machine.is_silent(now) is (told is not None):
+        report = machine.report
+        is_left_out = report is not None and report.is_left_out
+        if (is_left_out or machine.is_silent(now)) is (told is not None):
             self._since.pop(key, None)
         elif now - self._since.setdefault(key, now) >= LASTING:
-            heard = machine.report.window.end if machine.report else wall - LASTING
+            heard = report.window.end if report else wall - LASTING
             del self._since[key]
             if told is not None:
                 del self._told[key]
@@ -111,12 +116,16 @@ class Silences:
 
 def _silence(since: float, machine: KnownMachine, language: Language | None) -> EventDocument:
     """Return the silence of a machine as an event."""
-    health = machine.report.health if machine.report else None
+    report = None if machine.report is None else report_in(machine.report, language)
+    health = report.health if report else None
     language = language or (health.language if health else "en")
-    words = words_in(language)
+    words, advice = words_in(language), texts_in(language)("check_daemon")
+    condition, text = words["silence"], words["silence_text"]
+    if report is not None and health is not None and report.is_left_out:
+        condition, text, advice, since = words["left_out"], health.reason, words["left_out_advice"], health.since
     return EventDocument(
-        id=f"silent@{since:.3f}", part="", state=Level.NO_DATA, start=since, since=since, condition=words["silence"],
-        text=words["silence_text"], advice=texts_in(language)("check_daemon"), language=language,
+        id=f"silent@{since:.3f}", part="", state=Level.NO_DATA, start=since, since=since, condition=condition,
+        text=text, advice=advice, language=language,
         timezone=health.timezone if health else None,
         evidence=EvidenceDocument(windows=(0, 0)),
     )  # fmt: skip
