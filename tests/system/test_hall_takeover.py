@@ -57,6 +57,7 @@ def test_machines_are_added_changed_and_removed_without_touching_the_others(hall
     assert bad.health.state is Level.NO_DATA
     assert "estimat" in bad.health.reason
     assert "bad.toml" in bad.health.reason
+    assert bad.daemon == hall.reports["one"][-1].daemon
     lengths = [report.window.end - report.window.start for report in hall.reports["two"]]
     assert max(lengths) > 2.5 > min(lengths)
     assert follow(hall.reports["two"])  # which goes on from its history

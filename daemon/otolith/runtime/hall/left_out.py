@@ -2,10 +2,13 @@
 
 from collections.abc import Collection, Iterable
 
+from otolith import __version__
 from otolith.acquisition.window import Verdict
 from otolith.discovery.alternatives import WindowDecision
 from otolith.health.limits import MACHINE, Level
 from otolith.health.schema import (
+    CertificateDocument,
+    DaemonDocument,
     DriverDocument,
     HealthDocument,
     PartDocument,
@@ -56,11 +59,16 @@ class LeftOut:
                     before.remove(*names)
                 publisher.add(Published(*names))
                 self._published[names] = publisher
-            publisher.publish(left_out_report(refused, since, unix))
+            publisher.publish(left_out_report(refused, since, unix, publisher.certificate))
 
 
-def left_out_report(refused: Refused, since: float, now: float) -> ReportDocument:
-    """Return the report of a machine that is not served ``since`` a time; times in Unix s."""
+def left_out_report(
+    refused: Refused, since: float, now: float, certificate: CertificateDocument | None = None
+) -> ReportDocument:
+    """Return the report of a machine that is not served ``since`` a time; times in Unix s.
+
+    ``certificate`` is that of the daemon that leaves it out.
+    """
     site, machine = refused.names
     reason = texts_in(refused.language)("not_served", reason=refused.reason)
     quality = QualityDocument(
@@ -76,5 +84,6 @@ def left_out_report(refused: Refused, since: float, now: float) -> ReportDocumen
         parameters={},
         health=HealthDocument(**part.model_dump(), parts={MACHINE: part}, language=refused.language),
         driver=DriverDocument(up=False, reason=reason),
+        daemon=DaemonDocument(version=__version__, certificate=certificate),
         notes=(reason,),
     )
