@@ -260,8 +260,11 @@ def test_values_that_are_written_leave_the_limits_of_a_person(ran: Path, monkeyp
     ("shown", "words"),
     [
         ((3.0, 1.0), ("parameters.R_a", "3 ohm", "4", "low")),
-        ((6.6, 0.5), ("dc_motor", "omega", "50%", "90%", "[signals]")),
-        ((6.6, 1.0, ("other sign of T_load",)), ("no value is written", "other sign of T_load", "[signals]")),
+        ((6.6, 0.5), ("dc_motor", "omega", "50%", "90%", "[signals]", "'otolith twin list'")),
+        (
+            (6.6, 1.0, ("other sign of T_load",)),
+            ("no value is written", "other sign of T_load", "[signals]", "'otolith twin list'"),
+        ),
     ],
     ids=["outside the bounds of the file", "not described by the twin", "a contradiction"],
 )

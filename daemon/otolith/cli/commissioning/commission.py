@@ -162,8 +162,8 @@ def _refusal(machine: "LoadedMachine", found: "OwnValues") -> str:
 
     check = "check columns, units and signs in [signals]"
     if found.is_followed:
-        record = "or record the machine without what the twin lacks, as an unbalance or a load without a sensor"
-        return f"{'; '.join(found.faults)}: {check}, {record}"
+        record = "record the machine without what the twin lacks, as an unbalance or a load without a sensor"
+        return f"{'; '.join(found.faults)}: {check}, {record}, or take another twin of 'otolith twin list'"
     least = min(found.shares.items(), key=lambda item: item[1], default=None)
     left = "no value is determined"
     if least is not None and least[1] < MIN_SHARE:
