@@ -9,7 +9,7 @@ from otolith.cli.replay_batch import files_of_machines
 from otolith.machine import LoadedMachine, load_machine
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.replays import MACHINE
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,9 @@ def found(machines: list[LoadedMachine], folder: Path, *data: Path) -> dict[str,
     return {key: [str(path.relative_to(folder)) for path in paths] for key, paths in files.items()}
 
 
-def test_files_of_several_machines_are_found_by_folder_and_name(machine: LoadedMachine, tmp_path: Path) -> None:
+def test_files_of_several_machines_are_found_by_folder_and_name(
+    machine: LoadedMachine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     own = "hall.press-20260101T000000-1.rrd"
     made(tmp_path, "pump/2.csv", "pump/1.csv", "hall.saw/1.csv", "saw.csv", "saw.2026-01-02.csv", own, "notes.txt")
     made(tmp_path, ".hidden/1.csv", "pump/.hidden", "other/1.csv")
@@ -43,11 +45,15 @@ def test_files_of_several_machines_are_found_by_folder_and_name(machine: LoadedM
         "hall.saw": ["saw.2026-01-02.csv", "saw.csv", "hall.saw/1.csv"],
         "hall.press": [own],
     }
+    assert_says(caplog.text, "2 files", str(tmp_path / "notes.txt"), str(tmp_path / "other" / "1.csv"), "'pump.'")
 
 
-def test_a_machine_that_is_alone_has_all_files(machine: LoadedMachine, tmp_path: Path) -> None:
+def test_a_machine_that_is_alone_has_all_files(
+    machine: LoadedMachine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     made(tmp_path, "b.csv", "a.csv")
     assert found([machine], tmp_path) == {"site.motor": ["a.csv", "b.csv"]}
+    assert not caplog.text
     assert found([machine], tmp_path, tmp_path / "b.csv", tmp_path / "a.csv") == {"site.motor": ["b.csv", "a.csv"]}
 
 

@@ -1,6 +1,7 @@
 """``otolith replay --output``: recordings of many machines or months, by several processes, into a folder."""
 
 import contextlib
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,6 +28,8 @@ from otolith_drivers.errors import ConfigurationError, counted, some_names
 
 if TYPE_CHECKING:
     from otolith.runtime.batch.cluster import ClusterAccess
+
+log = logging.getLogger(__name__)
 
 
 def replay_batch(
@@ -115,13 +118,13 @@ def files_of_machines(machines: Sequence[LoadedMachine], data: Sequence[Path]) -
     """Return the recordings of each machine by its site and name, those of a folder in the order of their names.
 
     A machine that is alone has all files. Of several, each has the files in a folder of its name, the files that have
-    its name before the first point, and its own recordings.
+    its name before the first point, and its own recordings. Files in a folder that no machine has are logged.
 
     Raises:
         ConfigurationError: a machine has no file, or a file no machine.
     """
     found: dict[str, list[Path]] = {key_of_machine(machine): [] for machine in machines}
-    names = _names(machines)
+    names, left = _names(machines), list[str]()
     for path in data:
         listed = _listed(path)
         for file in listed:
@@ -130,6 +133,15 @@ def files_of_machines(machines: Sequence[LoadedMachine], data: Sequence[Path]) -
                 found[owner].append(file)
             elif file == path:
                 raise ConfigurationError(f"{path}: of which machine it is, its name does not say: {_rule(names)}")
+            else:
+                left.append(str(file))
+    if left:
+        log.warning(
+            "%s of none of these machines, not replayed: %s: %s",
+            counted(len(left), "file"),
+            some_names(left),
+            _rule(names),
+        )
     if lacking := [key for key, files in found.items() if not files]:
         where = some_names(list(map(str, data)))
         raise ConfigurationError(f"{where}: no file of {some_names(lacking)}: {_rule(names)}")
