@@ -360,7 +360,7 @@ def _block_diagonal(block: Array, weight: Array) -> Array:
 
 
 def constant_mode(bank: ImmPosterior) -> ImmPosterior:
-    """Return the mode before any window speaks for it: values as the ``bank`` knows them, without trends.
+    """Return the mode before any window supports it: values as the ``bank`` knows them, without trends.
 
     It has the probability of a mode that enters: a parameter may be drifting.
     """

@@ -1,4 +1,4 @@
-"""Orders of harmonics of an angle: whole ones in a prediction, where nothing speaks against it.
+"""Orders of harmonics of an angle: whole ones in a prediction, where nothing contradicts it.
 
 What turns with a shaft acts a whole number of times per turn, as an unbalance does once. The filter knows its order to
 an interval, and in a prediction over many turns that interval would become one of all phases.
