@@ -16,7 +16,7 @@ class Background:
     """Does one job after the other in a thread; the main thread takes what follows from each."""
 
     def __init__(self) -> None:
-        self._jobs: queue.SimpleQueue[Callable[[], Then | None]] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Callable[[], Then | None] | None] = queue.SimpleQueue()
         self._done: deque[Then] = deque()
         self._thread = threading.Thread(target=self._run, name="take-over", daemon=True)
 
@@ -31,10 +31,16 @@ class Background:
         while self._done:
             self._done.popleft()()
 
+    def stop(self, seconds: float) -> None:
+        """End after the jobs that wait, or after ``seconds``: what is left of a machine is written until then."""
+        if self._thread.ident is not None:
+            self._jobs.put(None)
+            self._thread.join(seconds)
+
     def _run(self) -> None:
-        while True:
+        while (job := self._jobs.get()) is not None:
             try:
-                then = self._jobs.get()()
+                then = job()
             except Exception:  # no job ends the others
                 log.exception("a machine was not taken over")
             else:

@@ -186,6 +186,7 @@ class Daemon:
                 steps.callback(service.close_driver)
             for service in services:
                 service.save_last()
+            steps.callback(self._background.stop, flush)  # it writes what is left of machines that were withdrawn
             self._notifier.send("STOPPING=1")
 
     def _reload(self) -> None:
@@ -204,6 +205,8 @@ class Daemon:
     def _take_over(self, changes: Changes) -> None:
         served = [service for service in self._served if service not in changes.ended]
         for service, revision in changes.revised:
+            if service not in served:  # it was withdrawn while files were read
+                continue
             with self._guarded(service, "not reloaded"):
                 service.take_over(revision)
         for service, reason in changes.kept:
