@@ -37,8 +37,10 @@ class RunningHall:
     def __init__(self, folder: Path) -> None:
         self.log = folder.parent / "daemon.log"
         with self.log.open("wb") as log:
-            command = [sys.executable, "-m", "otolith", "run", str(folder), "--workers", "2"]
-            self.daemon = subprocess.Popen(command, stdout=log, stderr=log)
+            # A daemon ignores SIGHUP where nohup does so for the tests.
+            daemon = [sys.executable, "-m", "otolith", "run", str(folder), "--workers", "2"]
+            command = ["env", "--default-signal=HUP", *daemon]
+            self.daemon = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._subscriber = Subscriber(Connection((ENDPOINT.format(folder=folder.parent),)), self._received.put)
         self.reports: defaultdict[str, list[ReportDocument]] = defaultdict(list)
