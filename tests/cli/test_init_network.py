@@ -106,14 +106,15 @@ def test_values_off_the_display_say_which_register_is_what(tmp_path: Path) -> No
     file = tmp_path / "drive.toml"
     with library_server(steady(), lambda _: steady()) as port:
         read = ["--modbus", f"127.0.0.1:{port}", "--registers", "10..13", "--seconds", 1.5]
-        shown = ["--display", "V_a=24,1 V", "--display", "i=2.31 A", "--display", "omega=1450 rpm"]
+        shown = ["--display", "V_a=24,1 V", "--display", "i=2.31A", "--display", "omega=1450 rpm"]
         otolith("init", file, *read, *shown)
         assert otolith("check", file).return_value == 0
         for wrong, words in {
             "omega=8000 rpm": ("omega", "8000", "--registers"),
             "omega=1450 V": ("omega", "V"),
             "omega=0 rpm": ("omega", "zero"),
-            "omega=fast": ("omega", "fast"),
+            "omega=fast": ("omega", "fast", "number"),
+            "omega=1450": ("omega", "unit", "rad/s"),
             "speed=1450 rpm": ("speed",),
         }.items():
             with raises_saying(ConfigurationError, *words):

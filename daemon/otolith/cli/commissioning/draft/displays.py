@@ -11,6 +11,7 @@ what was read, and the moment with the closest ones says which registers they ar
 
 import contextlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -43,6 +44,7 @@ USUAL = (  # units of one quantity between which displays and registers differ b
 )
 UNLIKELY = 1e6  # distance of what cannot be the same
 MOMENTS = 100  # at most, into which the readings are divided
+NUMBER = re.compile(r"\s*([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)")  # The unit may follow without a blank
 
 
 def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Definition]) -> Answers:
@@ -219,12 +221,15 @@ def _quantity(twin: Definition, name: str, text: str) -> tuple[float, str]:
     """Return number and unit of a displayed value; raise ConfigurationError if it is none of that signal."""
     if name not in twin.signals:
         raise ConfigurationError(f"--display {name}={text}: twin {twin.name}: {nearest(name, list(twin.signals))}")
-    number, _, unit = text.strip().partition(" ")
+    remedy = f'write it as --display "{name}=12.5 {twin.unit_of(name)}"'
+    if (shown := NUMBER.match(text)) is None:
+        raise ConfigurationError(f"--display {name}={text}: it has no number: {remedy}")
+    value, unit = float(shown[1].replace(",", ".")), text[shown.end() :].strip()
+    if not unit and twin.unit_of(name) != "1":
+        raise ConfigurationError(f"--display {name}={text}: its unit is missing: {remedy}")
     try:
-        value = float(number.replace(",", "."))
         factor(unit, twin.unit_of(name))
     except ValueError as error:
-        remedy = f'write it as --display "{name}=12.5 {twin.unit_of(name)}"'
         raise ConfigurationError(f"--display {name}={text}: {error}: {remedy}") from error
     if not math.isfinite(value) or value == 0.0:
         raise ConfigurationError(f"--display {name}={text}: a value of zero shows no scale: let the machine run")
