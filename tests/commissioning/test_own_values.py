@@ -387,3 +387,28 @@ def test_a_column_that_is_blank_or_constant_is_named(level: float) -> None:
     values = found(find_twin("dc_motor"), cut, set())
     assert "omega" in " ".join(values.faults)
     assert values.values == ()
+
+
+@pytest.mark.parametrize("seed", often([1], [1, 2]))
+def test_what_was_determined_beside_a_value_of_the_example_stays_as_uncertain(
+    motor: MotorScenario, windows: Cut, seed: int
+) -> None:
+    """At a speed that hardly changes, voltage constant and resistance trade, and the example's constant is wrong.
+
+    Where the resistance is not determined either (other seeds), it is as right as the constant, which is said.
+    """
+    true = {"R_a": 4.3, "L_a": 0.45, "J": 1.7e-3, "K_e": 0.06, "K_t": 0.06, "D": 2.1e-3}
+    points = tuple(point.model_copy(update={"speed": 14.0 + at}) for at, point in enumerate(motor.set_points))
+    update = {
+        "seed": seed,
+        "parameters": motor.parameters.model_copy(update=true),
+        "noise": motor.noise.model_copy(update={"speed": 0.02}),
+        "set_points": points,
+    }
+    twin = without_sensor(find_twin("dc_motor"), UnmeasuredInput("T_load", Assumption.CONSTANT))
+    cut = [window for window, _ in windows(motor.model_copy(update=update), 12)]
+    rows = by_name(found(twin, cut, {"T_load"}))
+    assert rows["K_e"].sd is None
+    sd = rows["R_a"].sd
+    assert sd is not None
+    assert abs(rows["R_a"].value - true["R_a"]) < 3.0 * sd

@@ -109,6 +109,7 @@ class ValueSearch:
         self._fixed: dict[str, str] = {}  # Not determined, and why
         self._equal: dict[str, str] = {}  # Taken as equal to another one
         self._rough: dict[str, float] = {}  # What the interval of one is compared with where the example is excluded
+        self._beside: dict[str, float] = {}  # Standard deviations of values before others were held
         self._last: _Fitted | None = None
 
     def run(self) -> OwnValues:
@@ -132,6 +133,7 @@ class ValueSearch:
         shares, misfits = self._simulated(fitted.stage)
         found = OwnValues((), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits)
         wide = [name for name in values if QUANTILE * spread[name] > DETERMINED * self._size(name, values[name])]
+        spread = {name: max(own, self._beside.get(name, 0.0)) for name, own in spread.items()}
         differ = [name for name in values if abs(others[name] - values[name]) > DIFFERENT * sd[name]]
         if found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
             return replace(found, values=self._values(others, spread))
@@ -212,8 +214,9 @@ class ValueSearch:
     def _hold(self, weakest: Sequence[str], values: Mapping[str, float], sd: Mapping[str, float]) -> None:
         """Take one of the parameters that only together are determined as equal to another one, or as stated.
 
-        A single one that is certainly not as stated keeps its wider interval: held there, it would bias all others. How
-        far it is off does not show beside others that are held.
+        A value that is determined beside it keeps the interval that it has before: held at a wrong value, it moves the
+        others by as much as they were uncertain together. A single one that is certainly not as stated keeps its wider
+        interval: held there, it would bias all others. How far it is off does not show beside others that are held.
         """
         parameters = self._problem.free
         for name in weakest:
@@ -228,6 +231,11 @@ class ValueSearch:
         if is_alone and self._excludes_example(first, values[first], sd[first]):
             self._rough[first] = WIDER_INTERVAL * QUANTILE * sd[first] / DETERMINED
             return
+        self._beside |= {
+            name: max(own, self._beside.get(name, 0.0))
+            for name, own in sd.items()
+            if name != weakest[0] and QUANTILE * own <= DETERMINED * self._size(name, values[name])
+        }
         remark = f"not determined beside {', '.join(others)}" if others else "the data do not show it"
         self._fixed[first] = remark
         for name in [name for name, other in self._equal.items() if other == first]:
