@@ -48,8 +48,7 @@ log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
-RECORDER_INTERVAL = 0.1  # s between two looks at the recorder
-WATCHDOG_INTERVAL = 0.1  # s between two looks whether windows are being finished
+LOOK_INTERVAL = 0.1  # s between two looks at the recorder, and whether windows are being finished
 STATUS_INTERVAL = 2.0  # s between two lines for systemd about a hall
 STORAGE_FLUSH, STORAGE_FLUSH_OF_MACHINE = 1.5, 0.03  # s to finish writing at the end of a hall, and for each machine
 
@@ -289,10 +288,10 @@ class Daemon:
         if (publisher := next((each.publisher for each in self._services.values()), None)) is not None:
             self._left_out.publish(publisher, now, time.time())
         self._show_preparation()
-        if now - self._watchdog_at >= WATCHDOG_INTERVAL:
+        if now - self._watchdog_at >= LOOK_INTERVAL:
             self._watchdog_at = now
             self._feed_watchdog(now)
-        if now - self._recorders_at >= RECORDER_INTERVAL or self._is_alone:
+        if now - self._recorders_at >= LOOK_INTERVAL or self._is_alone:
             self._recorders_at = now
             for service in self._served:
                 with self._guarded(service):
