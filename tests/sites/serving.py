@@ -72,3 +72,16 @@ def serving(folder: Path, *endpoints: str, more: str = "", tables: str = "") -> 
         finally:
             process.terminate()
             process.communicate(timeout=PATIENCE)
+
+
+@contextmanager
+def router(script: str, argument: str) -> Iterator[None]:
+    """A router as a process of its own: ``script`` prints that it is open, and ends with its input."""
+    command = [sys.executable, "-c", script, argument]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "open\n"
+        try:
+            yield
+        finally:
+            process.kill()

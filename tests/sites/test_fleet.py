@@ -2,12 +2,10 @@
 
 import json
 import re
-import subprocess
-import sys
 import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import SOCK_STREAM
@@ -25,7 +23,7 @@ from otolith_drivers.errors import ServiceError
 from tests.cli.commands import otolith
 from tests.conftest import free_port
 from tests.sites.machines import Daemon, report_of, sent
-from tests.sites.serving import serving
+from tests.sites.serving import router, serving
 from tests.storage.histories import MACHINE, SITE
 from tests.waiting import wait_for
 
@@ -94,17 +92,9 @@ class Fleet:
         table = ZenohTable.model_validate(tomllib.loads(self.block("toml", "[zenoh.tls]"))["zenoh"])
         return Daemon(self.folder, machine, access=Access(table, self.folder / "machine.toml"))
 
-    @contextmanager
-    def router(self, name: str) -> Iterator[None]:
+    def router(self, name: str) -> AbstractContextManager[None]:
         """A router with its file."""
-        command = [sys.executable, "-c", ROUTER, str(self.folder / f"{name}.json5")]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "open\n"
-            try:
-                yield
-            finally:
-                process.kill()
+        return router(ROUTER, str(self.folder / f"{name}.json5"))
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,8 @@
 """Router, daemon and site go and come in any order, and the site shows the machine again; nobody is told to."""
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from itertools import permutations
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access
 from tests.publishing.test_catch_up import ROUTER
 from tests.sites.machines import own_endpoint, report_of
-from tests.sites.serving import Served, serving
+from tests.sites.serving import Served, router, serving
 from tests.storage.histories import SITE
 from tests.variants import often
 from tests.waiting import wait_for
@@ -38,7 +36,7 @@ class Plant:
         """Start a part."""
         stack = self.stacks[part] = ExitStack()
         if part == "router":
-            stack.enter_context(router(self.endpoint))
+            stack.enter_context(router(ROUTER, self.endpoint))
         elif part == "daemon":
             access = Access(ZenohTable(listen=(), connect=(self.endpoint,)))
             self.publisher = Publisher([Published(SITE, MACHINE, None)], [], access)
@@ -57,18 +55,6 @@ class Plant:
         self.number += 1
         self.publisher.publish(report_of(MACHINE, self.number, time.time(), state=state))
         return f'id="count-{state.name}">1<' in self.served.ask("/").text
-
-
-@contextmanager
-def router(endpoint: str) -> Iterator[None]:
-    command = [sys.executable, "-c", ROUTER, endpoint]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "open\n"
-        try:
-            yield
-        finally:
-            process.kill()
 
 
 @pytest.fixture
