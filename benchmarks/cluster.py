@@ -89,7 +89,7 @@ def local_cluster(folder: Path, workers: int) -> Iterator[LocalCluster]:
         for _ in range(workers):
             start("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(folder))
         address = json.loads(file.read_text(encoding="utf-8"))["address"]
-        with Client(address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+        with Client(address, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # dask leaves it untyped
             client.wait_for_workers(workers, timeout=PATIENCE)
         yield LocalCluster(address, tuple(started[1:]))
     finally:

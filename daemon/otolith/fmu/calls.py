@@ -92,7 +92,7 @@ call: Any = intrinsic(_call)
 @njit(error_model="numpy")
 def entry(table: int, number: int) -> int:
     """Return an entry of the table."""
-    return load(table + 8 * number)  # type: ignore[no-any-return]
+    return load(table + 8 * number)  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
@@ -130,7 +130,7 @@ def computed(table: int) -> int:
         if status < REFUSED:
             given = (instance, entry(table, ROW_AT), states + outputs, rows, states + outputs)
             status = call(entry(table, GET_REALS), given)
-        return status  # type: ignore[no-any-return]
+        return status  # type: ignore[no-any-return]  # numba has no types
     status = call(entry(table, SET_STATES), (instance, arguments, states))
     # Parameters and discrete inputs may be set at an event only, and what depends on a limit is decided there.
     if status < REFUSED:
@@ -147,13 +147,13 @@ def computed(table: int) -> int:
     if status < REFUSED and outputs:
         given = (instance, entry(table, ROW_AT) + 4 * states, outputs, rows + 8 * states, outputs)
         status = call(entry(table, GET_REALS), given)
-    return status  # type: ignore[no-any-return]
+    return status  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
 def real_entry(table: int, number: int) -> float:
     """Return one of the entries that are numbers of double precision."""
-    return load_real(table + 8 * number)  # type: ignore[no-any-return]
+    return load_real(table + 8 * number)  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
@@ -167,7 +167,7 @@ def restored(table: int) -> int:
     """Bring the FMU into initialization mode with its start values; return the first status that is no success."""
     instance = entry(table, INSTANCE)
     if entry(table, SAVED):
-        return call(entry(table, RESTORE), (instance, entry(table, SAVED)))  # type: ignore[no-any-return]
+        return call(entry(table, RESTORE), (instance, entry(table, SAVED)))  # type: ignore[no-any-return]  # numba has no types
     start, tolerance = real_entry(table, START), 0.0
     status = call(entry(table, RESET), (instance,))
     if status < REFUSED and entry(table, IS_THIRD):
@@ -176,7 +176,7 @@ def restored(table: int) -> int:
         status = call(entry(table, SET_UP), (instance, 0, tolerance, start, 0, start))
         if status < REFUSED:
             status = call(entry(table, INITIALISE), (instance,))
-    return status  # type: ignore[no-any-return]
+    return status  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
@@ -188,12 +188,12 @@ def made_step(table: int, begin: float, length: float) -> int:
     instance, event, function = entry(table, INSTANCE), entry(table, EVENT_AT), entry(table, DO_STEP)
     may_forget = 0 if entry(table, SAVED) else 1
     if not entry(table, IS_THIRD):
-        return call(function, (instance, begin, length, may_forget))  # type: ignore[no-any-return]
+        return call(function, (instance, begin, length, may_forget))  # type: ignore[no-any-return]  # numba has no types
     given = (instance, begin, length, may_forget, event, event + 1, event + 2, event + NEXT_TIME)
     status = call(function, given)
     if status < REFUSED and (load_byte(event + 1) or load_byte(event + 2)):
         return REFUSED
-    return status  # type: ignore[no-any-return]
+    return status  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
@@ -201,7 +201,7 @@ def read_states(table: int, into: int) -> int:
     """Read the states into a buffer; return the status."""
     states = entry(table, STATES)
     given = (entry(table, INSTANCE), entry(table, ROW_AT), states, into, states)
-    return call(entry(table, GET_REALS), given)  # type: ignore[no-any-return]
+    return call(entry(table, GET_REALS), given)  # type: ignore[no-any-return]  # numba has no types
 
 
 @njit(error_model="numpy")
