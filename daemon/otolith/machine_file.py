@@ -22,7 +22,7 @@ from otolith.health.diagnosis import OwnRule
 from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
 from otolith.twin.definition import Definition
-from otolith.twin.language import FigureTable
+from otolith.twin.language import OwnFigureTable
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.time_zones import check_time_zone
@@ -293,8 +293,8 @@ class MachineFile(StrictModel):
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
     components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]  # Limits of amplitudes, by site
-    performance: Annotated[dict[str, FigureTable], Field(default_factory=dict)]
-    """Figures of performance; those of the twin are replaced by name."""
+    performance: Annotated[dict[str, OwnFigureTable], Field(default_factory=dict)]
+    """Figures of performance, and other keys of those of the twin, by name."""
     rule: tuple[OwnRule, ...] = ()  # Of the diagnosis, before the packaged ones
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # Standard deviation of each sensor
     process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # In the state's unit per s^0.5

@@ -43,6 +43,7 @@ from otolith.health.schema import (
     Status,
     WindowDocument,
 )
+from otolith.health.status import required_limits, with_lacks
 from otolith.health.text import PARTS, duration_text, reasons_of
 
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
@@ -191,7 +192,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         )
         for name, item in report.parameters.items()
     }
-    report = report.model_copy(update={"parameters": parameters})
+    report = with_lacks(report.model_copy(update={"parameters": parameters}))
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
     state = _with_agreement(replace(state, undetermined=undetermined), report)
@@ -378,7 +379,9 @@ def history_point(plan: MonitoringPlan, report: ReportDocument, name: str) -> tu
     """
     item, quantity = report.parameters[name], plan.parameters.get(name)
     is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
-    if quantity is None or not quantity.has_limits or not is_new or item.value is None or not item.sd:
+    if quantity is None or not is_new or item.value is None or not item.sd:
+        return None
+    if not quantity.has_limits and not required_limits(report, plan.parameters, name):
         return None
     time, value, sd = report.window.end, item.value, item.sd
     if report.decision is WindowDecision.LEARNED and item.raw is not None and item.raw_sd:
@@ -397,7 +400,7 @@ def _current_forecast(state: HealthState, report: ReportDocument, name: str) -> 
     is_contradicted = len(last) == PERSISTENT_WINDOWS and last[-1] - last[0] == PERSISTENT_WINDOWS - 1
     if own is None or not is_contradicted or last[-1] != report.window.index:
         return own
-    return ForecastDocument(computed=own.computed, reason=CONTRADICTED) if own.watch or own.act else own
+    return ForecastDocument(computed=own.computed, reason=CONTRADICTED) if own.watch or own.act or own.figures else own
 
 
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
@@ -407,8 +410,9 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
         if (point := history_point(plan, report, name)) is None:
             continue
         histories[name] = with_point(histories.get(name, ()), *point)
-        if plan.parameters[name].limits and is_due(forecasts.get(name), histories[name]):
-            forecasts[name] = forecast(plan.parameters[name], histories[name])
+        required = required_limits(report, plan.parameters, name)
+        if (plan.parameters[name].limits or required) and is_due(forecasts.get(name), histories[name]):
+            forecasts[name] = forecast(plan.parameters[name], histories[name], required)
         own, now = forecasts.get(name), report.window.end
         if seen := seen_trend(plan.parameters[name], histories[name], own, trends.get(name), now):
             trends[name] = seen

@@ -15,12 +15,14 @@ from typing import TypeVar
 from otolith.health.limits import Level
 from otolith.health.observations import CLOCK, DAEMON
 from otolith.health.schema import (
+    CrossingDocument,
     EventChange,
     EventDocument,
     EvidenceDocument,
     ForecastDocument,
     HealthDocument,
     Language,
+    PerformanceDocument,
     ReportDocument,
 )
 from otolith.health.text import texts_in
@@ -109,6 +111,7 @@ class TimeLabels:
         update = {
             "window": _labelled(self, report.window, "start", "end"),
             "parameters": parameters,
+            "performance": report.performance and {name: self._figure(row) for name, row in report.performance.items()},
             "components": tuple(_labelled(self, item, "onset") for item in report.components),
             "findings": tuple(_labelled(self, item, "since") for item in report.findings),
             "events": tuple(map(self.of_event, report.events)),
@@ -121,12 +124,21 @@ class TimeLabels:
         return _labelled(self, health, "since", "shelved").model_copy(update={"parts": parts})
 
     def _forecast(self, forecast: ForecastDocument) -> ForecastDocument:
-        crossings = {
-            name: _labelled(self, crossing, "at", "low", "high")
-            for name in ("watch", "act")
-            if (crossing := getattr(forecast, name)) is not None
+        def crossing(item: CrossingDocument) -> CrossingDocument:
+            return _labelled(self, item, "at", "low", "high")
+
+        update = {
+            "watch": forecast.watch and crossing(forecast.watch),
+            "act": forecast.act and crossing(forecast.act),
+            "figures": forecast.figures and {name: crossing(item) for name, item in forecast.figures.items()},
         }
-        return _labelled(self, forecast, "computed").model_copy(update=crossings)
+        return _labelled(self, forecast, "computed").model_copy(update=update)
+
+    def _figure(self, figure: PerformanceDocument) -> PerformanceDocument:
+        if (own := figure.requirement) is None or own.lacks is None:
+            return figure
+        requirement = own.model_copy(update={"lacks": _labelled(self, own.lacks, "at", "low", "high")})
+        return figure.model_copy(update={"requirement": requirement})
 
 
 def _labelled(labels: TimeLabels, document: Document, *names: str) -> Document:

@@ -23,7 +23,7 @@ never led, and it is over only after a day without it.
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from otolith.acquisition.window import Array
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan
-from otolith.health.limits import MonitoredQuantity
+from otolith.health.limits import Level, Limit, MonitoredQuantity
 from otolith.health.schema import CrossingDocument, ForecastDocument
 
 # Thresholds: docs/reference/thresholds-health.md has the origin of each.
@@ -51,6 +51,7 @@ MIN_GOING_ON = 0.2  # probability that a trend has not ended, for a forecast of 
 CHANGES = 4  # that have ended, after which a history is one of changes, and has no forecast
 MIN_LENGTH = 1e-6  # of a history: length of a sudden change
 ENDED = "the last change has ended"
+NO_LIMIT = "the trend leads to no further limit"
 GRID = 13, 15, 10  # points of onset, exponent or end, and time constant
 REFINEMENTS = 9  # of the grid, at most
 REFINED = 0.2  # of the points of a grid: how many must have weight so that it is not refined any more
@@ -359,22 +360,35 @@ def _log_sum(values: Array) -> float:
     return highest + math.log(float(np.exp(values - highest).sum()))
 
 
-def forecast(quantity: MonitoredQuantity, history: History) -> ForecastDocument:
-    """Return when the parameter of a history passes its limits, or why that cannot be forecast."""
-    now = history[-1][0]
-    change = max(abs(limit.value - quantity.nominal) for limit in quantity.limits)
-    trend = find_trend(history, change)
+def forecast(
+    quantity: MonitoredQuantity, history: History, required: Mapping[str, tuple[Limit, ...]] | None = None
+) -> ForecastDocument:
+    """Return when the parameter of a history passes its limits, or why that cannot be forecast.
+
+    ``required`` are further ones, beyond which a figure of performance lacks its required value, by its name. Limits or
+    some of these there must be.
+    """
+    now, required = history[-1][0], required or {}
+    limits = quantity.limits or tuple(itertools.chain(*required.values()))
+    trend = find_trend(history, max(abs(limit.value - quantity.nominal) for limit in limits))
     if isinstance(trend, str):
         return ForecastDocument(computed=now, reason=trend)
-    crossings: dict[str, CrossingDocument] = {}
-    for limit in quantity.limits:
-        crossing, key = trend.crossing(limit.value, is_lower=limit.is_lower), limit.level.lower()
-        if crossing is not None and (key not in crossings or now + crossing.median < crossings[key].at):
+    by_level = {level.lower(): [row for row in quantity.limits if row.level is level] for level in Level}
+    crossings = {key: first for key, rows in by_level.items() if (first := _first_crossing(trend, rows))}
+    figures = {name: first for name, rows in required.items() if (first := _first_crossing(trend, rows))}
+    reason = "" if crossings or figures else NO_LIMIT
+    return ForecastDocument(computed=now, family=trend.family, reason=reason, figures=figures or None, **crossings)
+
+
+def _first_crossing(trend: Trend, limits: Iterable[Limit]) -> CrossingDocument | None:
+    """Return when the first of some limits is passed; None if none is."""
+    now, found = trend.now, []
+    for limit in limits:
+        if (crossing := trend.crossing(limit.value, is_lower=limit.is_lower)) is not None:
             high = now + crossing.high if math.isfinite(crossing.high) else None
-            at = now + crossing.median
-            crossings[key] = CrossingDocument(limit=limit.value, at=at, low=now + crossing.low, high=high)
-    reason = "" if crossings else "the trend leads to no further limit"
-    return ForecastDocument(computed=now, family=trend.family, reason=reason, **crossings)
+            times = {"at": now + crossing.median, "low": now + crossing.low, "high": high}
+            found.append(CrossingDocument(limit=limit.value, **times))
+    return min(found, key=lambda item: item.at, default=None)
 
 
 def is_due(before: ForecastDocument | None, history: History) -> bool:
@@ -384,7 +398,7 @@ def is_due(before: ForecastDocument | None, history: History) -> bool:
     """
     if before is None or not 0.0 <= history[-1][0] - before.computed < REFIT * span(history):
         return True
-    leads = before.watch is not None or before.act is not None
+    leads = before.watch is not None or before.act is not None or before.figures is not None
     return leads and sum(time > before.computed for time, _, _ in history[-MIN_POINTS_AFTER:]) >= MIN_POINTS_AFTER
 
 

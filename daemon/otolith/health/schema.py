@@ -266,12 +266,13 @@ class CrossingDocument(DocumentModel):
 
 
 class ForecastDocument(DocumentModel):
-    """Whether and when a parameter will pass its limits, from its history."""
+    """When a parameter will pass limits, and lead figures of performance beyond required values, from its history."""
 
     computed: float  # Unix seconds
     family: Literal["", "linear", "exponential"] = ""  # Of the trend; empty without one
     watch: CrossingDocument | None = None
     act: CrossingDocument | None = None
+    figures: dict[str, CrossingDocument] | None = None  # When each figure will lack its required value, by its name
     reason: str = ""  # Why there is no forecast
 
 
@@ -300,6 +301,33 @@ class ParameterDocument(DocumentModel):
     advice: str | None = None  # The experiment that would determine the parameter, if this window did not
 
 
+class KeptDocument(DocumentModel):
+    """Values of a parameter between which a figure of performance keeps its required value, others as they are."""
+
+    low: float | None = None  # In the unit of the parameter, at the present temperature; None if no bound is beyond
+    high: float | None = None
+    unit: str
+
+
+class LackDocument(CrossingDocument):
+    """When a figure of performance will lack its required value: when a parameter passes ``limit``."""
+
+    parameter: str
+    unit: str  # Of the parameter
+
+
+class RequirementDocument(DocumentModel):
+    """The required value of a figure of performance, and whether the machine has it."""
+
+    value: float  # In the unit of the figure
+    met: bool | None = None  # Now; None while the 95 % interval holds the required value, or there is no value
+    met_at_baseline: bool | None = None  # Of the baseline; None without one
+    met_at_limit: bool | None = None  # With the parameter at its limit; None without one
+    kept: dict[str, KeptDocument] | None = None  # By the parameter
+    lacks: LackDocument | None = None  # From when on it is not met, if a trend goes on
+    reason: str = ""  # Why no time is known, while it is met
+
+
 class PerformanceDocument(DocumentModel):
     """A figure of performance: what the machine costs or yields."""
 
@@ -320,6 +348,7 @@ class PerformanceDocument(DocumentModel):
     limited: str | None = None
     limit: float | None = None  # In the unit of that parameter, at the present temperature
     limit_unit: str | None = None
+    requirement: RequirementDocument | None = None  # None if nothing is required
 
 
 class FitDocument(DocumentModel):

@@ -17,8 +17,18 @@ from otolith.estimation.information import (
     at_its_bound,
 )
 from otolith.estimation.window_fit import AT_BOUND
-from otolith.health.limits import Level, MonitoredQuantity
-from otolith.health.schema import DriverDocument, ParameterDocument, PerformanceDocument, SourceDocument, Status
+from otolith.health.limits import Level, Limit, MonitoredQuantity
+from otolith.health.schema import (
+    DriverDocument,
+    KeptDocument,
+    LackDocument,
+    ParameterDocument,
+    PerformanceDocument,
+    ReportDocument,
+    RequirementDocument,
+    SourceDocument,
+    Status,
+)
 from otolith.simulation.performance import FigureValue, ReferenceValues
 from otolith.twin.definition import Parameter
 from otolith_drivers.base import Link
@@ -227,6 +237,7 @@ def with_absent_sources(
     }
 
 
+NO_LACK = "the trend does not lead to the required value"
 NOT_KNOWN = "not determined yet: {}"  # Parameters on which a figure of performance depends
 
 
@@ -264,7 +275,7 @@ def _performance_document(item: FigureValue, documents: Mapping[str, ParameterDo
         value = sd = None
     limit_unit = documents[item.limited].unit if item.limited else None
     is_known = value is not None
-    return PerformanceDocument(
+    document = PerformanceDocument(
         meaning=figure.meaning,
         value=value,
         unit=figure.unit,
@@ -283,3 +294,67 @@ def _performance_document(item: FigureValue, documents: Mapping[str, ParameterDo
         limit=item.limit if is_known else None,
         limit_unit=limit_unit if is_known else None,
     )
+    return document.model_copy(update={"requirement": _requirement(item, document, documents)})
+
+
+def _requirement(
+    item: FigureValue, document: PerformanceDocument, documents: Mapping[str, ParameterDocument]
+) -> RequirementDocument | None:
+    """Return whether a figure has its required value; None if nothing is required."""
+    figure = item.figure
+    if figure.required is None:
+        return None
+    low, high, baseline, at_limit = document.low, document.high, document.baseline, document.at_limit
+    if low is None or high is None:
+        return RequirementDocument(value=figure.required)
+    kept = {
+        name: KeptDocument(low=low, high=high, unit=documents[name].unit) for name, (low, high) in item.kept.items()
+    }
+    return RequirementDocument(
+        value=figure.required,
+        met=figure.meets(low) if figure.meets(low) == figure.meets(high) else None,
+        met_at_baseline=None if baseline is None else figure.meets(baseline),
+        met_at_limit=None if at_limit is None else figure.meets(at_limit),
+        kept=kept or None,
+    )
+
+
+def required_limits(
+    report: ReportDocument, plan: Mapping[str, MonitoredQuantity], name: str
+) -> dict[str, tuple[Limit, ...]]:
+    """Return where a parameter leads figures to their required values, by figure, at the reference temperature."""
+    quantity, found = plan[name], {}
+    for figure, row in (report.performance or {}).items():
+        kept = ((row.requirement and row.requirement.kept) or {}).get(name)
+        if kept is None:
+            continue
+        ends = ((kept.low, True), (kept.high, False))
+        referred = [
+            (quantity.referred(end, 0.0, report.window.observed or {}), below) for end, below in ends if end is not None
+        ]
+        found[figure] = tuple(Limit(Level.WATCH, end[0], below) for end, below in referred if end is not None)
+    return {figure: limits for figure, limits in found.items() if limits}
+
+
+def with_lacks(report: ReportDocument) -> ReportDocument:
+    """Return the report; each figure that has its required value says from when on it will lack it.
+
+    That is by the forecast of the parameter that leads there first. Otherwise it says of each parameter why not.
+    """
+    changed = {}
+    for figure, row in (report.performance or {}).items():
+        if (own := row.requirement) is None or own.met is False or row.value is None:
+            continue
+        first, reasons = None, []
+        for name in row.parameters:
+            if (forecast := report.parameters[name].forecast) is None:
+                continue
+            crossing = (forecast.figures or {}).get(figure)
+            if crossing is None or crossing.at <= report.window.end:
+                reasons.append(f"{name}: {forecast.reason or NO_LACK}")
+            elif first is None or crossing.at < first.at:
+                first = LackDocument(parameter=name, unit=report.parameters[name].unit, **dict(crossing))
+        reason = "" if first is not None else "; ".join(reasons)
+        requirement = own.model_copy(update={"lacks": first, "reason": reason})
+        changed[figure] = row.model_copy(update={"requirement": requirement})
+    return report.model_copy(update={"performance": {**(report.performance or {}), **changed}}) if changed else report

@@ -31,9 +31,10 @@ from otolith.health.schema import (
     PartDocument,
     PerformanceDocument,
     ReportDocument,
+    RequirementDocument,
     Status,
 )
-from otolith.health.times import Clock, clock_in, in_local_time
+from otolith.health.times import Clock, clock_in, expected_text, in_local_time
 from otolith_drivers.units import equation_text, quantity_text, scale_of, unit_text
 
 UNKNOWN = "unknown"
@@ -248,10 +249,14 @@ def parameter_text(name: str, parameter: ParameterDocument) -> str:
     return f"{text} ({parameter.status}: {parameter.reason})"
 
 
-def performance_texts(item: PerformanceDocument, texts: Texts) -> list[str]:
-    """A figure of performance in sentences: its value, against that of the healthy machine, and at a limit."""
+def performance_texts(item: PerformanceDocument, texts: Texts, zone: str | None = None) -> list[str]:
+    """A figure of performance in sentences: its value, against that of the healthy machine, and at a limit.
+
+    Also whether these are as required, and until when; ``zone`` is that of the plant.
+    """
     if item.value is None or item.sd is None:
         return [texts("no_figure", reason=texts.translated(item.reason))]
+    required = item.requirement
     lines = [interval_text(item.value, item.sd, item.unit)]
     if item.status is not Status.ESTIMATED:
         lines[0] += f" ({texts.translated(item.status)}: {texts.translated(item.reason)})"
@@ -260,11 +265,38 @@ def performance_texts(item: PerformanceDocument, texts: Texts) -> list[str]:
         key = "as_healthy" if is_same else "more_than_healthy" if item.value > item.baseline else "less_than_healthy"
         healthy = quantity_text(item.baseline, item.unit)
         share = f"{abs(item.value / item.baseline - 1.0):.0%}".replace("%", " %") if item.baseline else ""
-        lines.append(texts(key, share=share, healthy=healthy).strip())
+        text = texts(key, share=share, healthy=healthy).strip()
+        lines.append(text + (_as_required(required.met_at_baseline, texts) if required else ""))
     if item.at_limit is not None and item.limit is not None:
         limit, value = quantity_text(item.limit, item.limit_unit or "1"), quantity_text(item.at_limit, item.unit)
-        lines.append(texts("figure_at_limit", name=item.limited, limit=limit, value=value))
+        text = texts("figure_at_limit", name=item.limited, limit=limit, value=value)
+        lines.append(text + (_as_required(required.met_at_limit, texts) if required else ""))
+    if required is not None:
+        lines.append(_required_text(required, item.unit, texts, zone))
     return lines
+
+
+def _as_required(is_met: bool | None, texts: Texts) -> str:
+    return "" if is_met is None else texts("as_required" if is_met else "not_as_required")
+
+
+def _required_text(item: RequirementDocument, unit: str, texts: Texts, zone: str | None) -> str:
+    """Whether a figure has its required value, until when, or else as long as which parameters are inside."""
+    key = "met_open" if item.met is None else "met" if item.met else "not_met"
+    text = texts(key, required=quantity_text(item.value, unit))
+    if (lacks := item.lacks) is not None:
+        spread = (lacks.at if lacks.high is None else lacks.high) - lacks.low
+        low, at = expected_text(lacks.low, spread, zone), expected_text(lacks.at, spread, zone)
+        high = texts("later") if lacks.high is None else expected_text(lacks.high, spread, zone)
+        limit = quantity_text(lacks.limit, lacks.unit)
+        return text + texts("no_longer_met", name=lacks.parameter, limit=limit, at=at, low=low, high=high)
+    inside = [
+        texts(key, name=name, limit=quantity_text(end, row.unit))
+        for name, row in (item.kept or {}).items()
+        for key, end in (("from_limit", row.low), ("up_to_limit", row.high))
+        if end is not None
+    ]
+    return text + texts("met_while", inside=", ".join(inside)) if inside else text
 
 
 def component_text(component: ComponentDocument, texts: Texts) -> str:

@@ -7,6 +7,7 @@ from functools import partial
 from otolith.acquisition.quality import is_of_calendar, time_text
 from otolith_drivers.common.time_zones import local_moment, utc_seconds
 
+NO_TIME_OF_DAY = 172800.0  # s: docs/reference/thresholds-health.md has its origin
 Clock = Callable[[float], str]  # From Unix seconds to what people read
 DATE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d+)? UTC")  # As time_text writes it
 
@@ -14,6 +15,14 @@ DATE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d+)? UTC")  # As time_te
 def moment_text(seconds: float, zone: str | None = None) -> str:
     """A time of the data without fractions of a second, as that of an event: it is known to a window."""
     return f"{local_moment(seconds, zone):%F %T %Z}" if is_of_calendar(seconds) else time_text(seconds)
+
+
+def expected_text(seconds: float, spread: float, zone: str | None = None) -> str:
+    """A time in the future, which is known to ``spread`` s: the day alone, if that is more than two days."""
+    if not is_of_calendar(seconds):
+        return time_text(seconds)
+    moment = local_moment(seconds, zone)
+    return f"{moment:%F}" if spread > NO_TIME_OF_DAY else f"{moment:%F %H:%M %Z}"
 
 
 def clock_in(zone: str | None) -> Clock:

@@ -11,6 +11,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.resources import files
 from itertools import pairwise
 from typing import Any, Protocol
@@ -197,8 +198,9 @@ def html_report(reader: PageSource, samples: Iterable[HistorySample], interval: 
     say = texts_in(language or "en")
     is_dated = is_of_calendar(axis.begin)
     own_when = (lambda seconds: _moment(seconds, axis.zone, "%F %T")) if is_dated else clock_in(axis.zone)
-    own = {"when": own_when, "part": say.part}
+    own: dict[str, Any] = {"when": own_when, "part": say.part}
     own["words"] = say.translated
+    own["performance_texts"] = partial(text.performance_texts, zone=axis.zone)
     own["note"] = lambda written: whole(say.decimals(written))  # in the words of a person, whose times stay
     own["whole"] = lambda written: whole(say.decimals(in_local_time(written, axis.zone)))
     environment.filters |= vars(text) | {"quantity_text": quantity_text} | own

@@ -8,7 +8,7 @@ method (C. M. Bishop, Pattern Recognition and Machine Learning, section 4.5.2 ha
 
 import ast
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -19,6 +19,7 @@ from otolith.twin.expressions import evaluate, names_in, parse
 from otolith.twin.rates import ordered_equations
 from otolith_drivers.units import to_base
 
+SEARCHED, REFINEMENTS = 33, 4  # values of a parameter at which a figure is compared with what is required, and rounds
 MIN_STEP = 1e-6  # of the size of a parameter: of its central difference. docs/reference/thresholds-simulation.md
 
 
@@ -54,6 +55,9 @@ class FigureValue:
     limit: float | None = None  # In the unit of that parameter
     is_mean: bool = False  # Whether it is a mean over the window
     reason: str = ""
+    kept: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    """The values of each parameter, in its unit, between which the required value is kept, others as they are; None
+    where no bound of the twin is beyond. Empty if nothing is required, or it is not kept now."""
 
 
 def figures_of(twin: Definition, estimates: Estimates, window: Window, predicted: Array | None) -> list[FigureValue]:
@@ -109,7 +113,41 @@ def _figure(
     )
     at_limit, limited, limit = worst or (None, "", None)
     numbers = float(means[0]), max(variance, 0.0) ** 0.5, healthy, at_limit, limited, limit
-    return FigureValue(figure, own, *numbers, is_mean=bool(driving))
+    kept = {} if figure.required is None or not figure.meets(float(means[0])) else _kept(twin, figure, own, columns)
+    return FigureValue(figure, own, *numbers, is_mean=bool(driving), kept=kept)
+
+
+def _kept(
+    twin: Definition, figure: Figure, own: Sequence[str], columns: Mapping[str, Array]
+) -> dict[str, tuple[float | None, float | None]]:
+    """Return between which values of each parameter a figure keeps its required value, which it does now.
+
+    ``columns`` begin with the present values. From there on to both bounds of the twin, the interval between two of
+    :data:`SEARCHED` values in which it is first not kept is divided again and again.
+    """
+    present = {name: column[:1] for name, column in columns.items()}
+    ranges = {}
+    for name in own:
+        parameter, value = twin.parameter(name), float(present[name][0, 0])
+        ends = [_end(twin, figure, name, (value, bound), present) for bound in (parameter.low, parameter.high)]
+        if any(end is not None for end in ends):
+            ranges[name] = (ends[0], ends[1])
+    return ranges
+
+
+def _end(
+    twin: Definition, figure: Figure, name: str, ends: tuple[float, float], present: Mapping[str, Array]
+) -> float | None:
+    """Return the first value of a parameter on the way between two at which a figure lacks its required value."""
+    begin, end = ends
+    for _ in range(REFINEMENTS):
+        values = np.linspace(begin, end, SEARCHED)
+        means = _evaluated(twin, figure, {**present, name: values[:, None]}, SEARCHED)
+        lacks = np.flatnonzero([np.isfinite(mean) and not figure.meets(float(mean)) for mean in means])
+        if not len(lacks):
+            return None
+        begin, end = float(values[max(lacks[0] - 1, 0)]), float(values[lacks[0]])
+    return end
 
 
 def _signals(twin: Definition, names: Sequence[str], window: Window, predicted: Array | None) -> dict[str, Array] | str:

@@ -108,6 +108,12 @@ class Figure:
     better: Literal["lower", "higher"]
     at: tuple[tuple[str, float], ...] = ()
     """Values of inputs and states, the operating point; the others are those of the window, and the figure its mean."""
+    required: float | None = None  # In unit: the value that the machine must keep, or a better one
+
+    def meets(self, value: float) -> bool:
+        """Whether a value is at least as good as the required one, which there must be."""
+        assert self.required is not None  # noqa: S101 - for mypy
+        return value <= self.required if self.better == "lower" else value >= self.required
 
 
 @dataclass(frozen=True, slots=True)

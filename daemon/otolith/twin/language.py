@@ -127,11 +127,23 @@ class _SiteTable(_QuantityTable):
 
 
 class FigureTable(_QuantityTable):
-    """A figure of performance, in a twin or in a machine file."""
+    """A figure of performance."""
 
     expression: str
     better: Literal["lower", "higher"]
     at: Annotated[dict[str, Number], Field(default_factory=dict)]
+    required: Number | None = None
+
+
+class OwnFigureTable(StrictModel):
+    """A figure of performance in a machine file; what it does not state is that of the figure of the twin."""
+
+    unit: Unit | None = None
+    meaning: str | None = None
+    expression: str | None = None
+    better: Literal["lower", "higher"] | None = None
+    at: dict[str, Number] | None = None
+    required: Number | None = None
 
 
 class _TwinFile(StrictModel):
@@ -168,15 +180,25 @@ def read_twin(page: SourceFile) -> Definition:
     return definition
 
 
-def with_performance(definition: Definition, tables: Mapping[str, FigureTable], fault: Fault) -> Definition:
-    """Return the twin with other figures of performance, which replace those of the same name; reports each fault."""
+def with_performance(definition: Definition, tables: Mapping[str, OwnFigureTable], fault: Fault) -> Definition:
+    """Return the twin with other figures of performance, and with other keys of its own; reports each fault."""
     for name in tables:
         try:
             check_name(name)
         except ValueError as error:
             fault(("performance", name), str(error))
     own = {figure.name: figure for figure in definition.performance}
-    own |= {name: _figure(name, table, definition.units(), fault) for name, table in tables.items()}
+    for name, table in tables.items():
+        known, written = own.get(name), table.model_dump(exclude_none=True)
+        if known is not None:
+            written = {key: getattr(known, key) for key in FigureTable.model_fields if key != "at"} | written
+            written = {"at": dict(known.at)} | written
+        missing = [key for key, row in FigureTable.model_fields.items() if row.is_required() and key not in written]
+        if missing:
+            text = f"the twin has no figure {name!r}, so {missing[0]} is needed here: {nearest(name, list(own))}"
+            fault(("performance", name), text)
+            continue
+        own[name] = _figure(name, FigureTable(**written), definition.units(), fault)
     complete = replace(definition, performance=tuple(own.values()))
     checker = _EquationChecker(complete, fault)
     checker.check()
@@ -185,17 +207,20 @@ def with_performance(definition: Definition, tables: Mapping[str, FigureTable], 
 
 
 def _figure(name: str, table: FigureTable, units: Mapping[str, str], fault: Fault) -> Figure:
-    """Return a figure with its operating point in the units of the twin; a name that is none is reported later."""
-    values = []
-    for signal, written in table.at.items():
-        value = math.nan if isinstance(written, str) else float(written)
-        if isinstance(written, str) and signal in units:
-            try:
-                value = Quantity(units[signal]).convert(written)
-            except ValueError as error:
-                fault(("performance", name, "at", signal), str(error))
-        values.append((signal, value))
-    return Figure(name, table.unit, table.meaning, table.expression, table.better, tuple(values))
+    """Return a figure with its numbers in the units of the twin; a name that is none is reported later."""
+
+    def number(written: Number, unit: str | None, *at: str) -> float:
+        if not isinstance(written, str):
+            return float(written)
+        try:
+            return math.nan if unit is None else Quantity(unit).convert(written)
+        except ValueError as error:
+            fault(("performance", name, *at), str(error))
+            return math.nan
+
+    point = tuple((signal, number(written, units.get(signal), "at", signal)) for signal, written in table.at.items())
+    required = None if table.required is None else number(table.required, table.unit, "required")
+    return Figure(name, table.unit, table.meaning, table.expression, table.better, point, required)
 
 
 def equation_faults(definition: Definition) -> list[str]:

@@ -314,8 +314,8 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
 
 def _performance(document: ReportDocument, texts: Texts) -> list[Text]:
     """What the machine costs or yields now, against the healthy machine and at a limit."""
-    rows = (document.performance or {}).values()
-    return [Text(f"{texts.translated(row.meaning)}: {PARTS.join(performance_texts(row, texts))}") for row in rows]
+    rows, zone = (document.performance or {}).values(), zone_of(document)
+    return [Text(f"{texts.translated(row.meaning)}: {PARTS.join(performance_texts(row, texts, zone))}") for row in rows]
 
 
 def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[Text]:
