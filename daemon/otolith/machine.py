@@ -37,6 +37,7 @@ from otolith.machine_file import (
     signal_units,
     window_options,
 )
+from otolith.service_file import SERVICE_FILE, with_service_file
 from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin, with_performance
@@ -82,6 +83,7 @@ class LoadedMachine:
     built_driver: Driver | None  # None if the file was loaded without its driver
     complete: Definition  # The twin as its author wrote it, with inputs that no sensor measures
     unmeasured: tuple[UnmeasuredInput, ...] = ()  # Those inputs
+    of_service: tuple[str, ...] = ()  # Tables that are in the file of the service beside the machine file
 
     @property
     def driver(self) -> Driver:
@@ -97,6 +99,10 @@ class LoadedMachine:
             ConfigurationError: the FMU cannot be used; with the reason.
         """
         return None if self.twin.fmu is None else try_fmu(self.twin.fmu)
+
+    def path_of(self, table: str) -> Path:
+        """Return the file that has a table."""
+        return self.path.with_name(SERVICE_FILE) if table in self.of_service else self.path
 
     @property
     def title(self) -> str:
@@ -185,8 +191,10 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     """
     source = read(path)
     data = parse(source)
+    if path.name == SERVICE_FILE and "machine" not in data:
+        data.setdefault("service", {})  # it is told as what it is, whatever it has
     expect(source, data, "machine")
-    file = validate(data, MachineFile, source)
+    file, of_service = with_service_file(validate(data, MachineFile, source), path)
     context = Context(source)
     complete = _twin(file, path, context)
     if file.performance:
@@ -205,7 +213,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
         driver = build_driver(driver_configs(file, twin, source))
     varying = frozenset(item.name for item in unmeasured if item.assumption is Assumption.CONSTANT)
     plan = replace(_plan(file, twin, complete, problem, context), varying=varying)
-    return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured)
+    return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured, of_service)
 
 
 def _unmeasured(file: MachineFile, twin: Definition, source: SourceFile) -> tuple[UnmeasuredInput, ...]:

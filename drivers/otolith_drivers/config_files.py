@@ -45,6 +45,7 @@ KINDS = {
     "plant": ("a scenario of the simulated plant", "otolith plant"),
     "machine": ("a machine file", "otolith run"),
     "equations": ("a twin", "otolith twin check"),
+    "service": ("the file of a service", "otolith run DIRECTORY"),
 }
 """By the key that only this kind of file has: its name, and the command that reads it."""
 

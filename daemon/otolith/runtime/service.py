@@ -102,7 +102,8 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
         rest, limits = [*rest, *limits], []
     if limits:
         update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
-    machine = replace(running, file=old.model_copy(update=update), plan=new.plan if limits else running.plan)
+    plan = new.plan if limits else running.plan
+    machine = replace(running, file=old.model_copy(update=update), plan=plan, of_service=new.of_service)
     return Reload(machine, bool(limits), recording, access, tuple(".".join(key) for key in rest))
 
 
@@ -209,7 +210,7 @@ class Service:
     @property
     def access(self) -> Access:
         """Who may read its reports."""
-        return Access(self._loaded.file.zenoh, self._loaded.path)
+        return Access(self._loaded.file.zenoh, self._loaded.path_of("zenoh"))
 
     @property
     def published(self) -> Published:

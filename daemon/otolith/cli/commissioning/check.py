@@ -117,7 +117,9 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         f"{swarm.generations} generations, seed {swarm.seed}"
     )
     endpoints = listening(file.zenoh.listen, f"{file.machine.site}.{file.machine.name}")
-    _, validity = Access(file.zenoh, machine.path).settings([prefix(file.machine.site, file.machine.name)], endpoints)
+    _, validity = Access(file.zenoh, machine.path_of("zenoh")).settings(
+        [prefix(file.machine.site, file.machine.name)], endpoints
+    )
     lines += [f"! {warning}"] if (warning := validity.warning(datetime.now(UTC))) else []
     lines.append(
         f"reports on {', '.join(endpoints) or 'no endpoint'}, keys {prefix(file.machine.site, file.machine.name)}/..."

@@ -45,7 +45,9 @@ def complete_lines(machine: LoadedMachine, source: SourceFile) -> Iterator[str]:
         yield from ("[[rule]]", *_written(rule), "")
     yield from _noise(machine, data)
     for name in MachineFile.model_fields:
-        if name not in OF_THE_MACHINE:
+        if name in machine.of_service:
+            yield from (_prose(f"[{name}]: as in {machine.path_of(name).name}, as long as it is not written here"), "")
+        elif name not in OF_THE_MACHINE:
             yield from _table((name,), getattr(machine.file, name), data.get(name, {}))
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from otolith.machine import LoadedMachine, load_machine
-from otolith.runtime.hall.files import Refused, one_line, read_files
+from otolith.runtime.hall.files import Refused, files_in, one_line, read_files
 from otolith.runtime.service import Revision, Service
 from otolith_drivers.errors import OtolithError
 
@@ -36,7 +36,7 @@ def changes_of_hall(served: Sequence[Service], paths: Sequence[Path]) -> Changes
     """
     by_path = {service.path: service for service in served}
     by_names = {service.names: service for service in served}
-    empty = [path.absolute() for path in paths if not path.is_file() and not any(path.glob("*.toml"))]
+    empty = [path.absolute() for path in paths if not path.is_file() and not files_in([path])]
     files = read_files([path for path in paths if path.absolute() not in empty], by_path)
     changes = Changes(refused=tuple(each for each in files.refused if each.path not in by_path))
     changes.kept.extend((by_path[each.path], each.reason) for each in files.refused if each.path in by_path)

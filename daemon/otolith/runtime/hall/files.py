@@ -10,6 +10,7 @@ from pathlib import Path
 from otolith.health.schema import LANGUAGES, Language
 from otolith.machine import LoadedMachine, load_machine
 from otolith.machine_file import MachineTable, check_name
+from otolith.service_file import SERVICE_FILE
 from otolith.storage.state_store import is_served
 from otolith_drivers.errors import OtolithError
 
@@ -47,8 +48,12 @@ def usable(path: Path) -> LoadedMachine:
 
 def files_in(paths: Sequence[Path]) -> list[Path]:
     """Return the machine files that are meant, each once, those of a directory by name."""
-    files = [sorted(path.glob("*.toml")) if path.is_dir() else [path] for path in paths]
+    files = [_machine_files(path) if path.is_dir() else [path] for path in paths]
     return list(dict.fromkeys(file.absolute() for each in files for file in each))
+
+
+def _machine_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*.toml") if path.name != SERVICE_FILE)
 
 
 def read_files(paths: Sequence[Path], served: Collection[Path] = ()) -> MachineFiles:
