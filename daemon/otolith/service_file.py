@@ -1,7 +1,7 @@
 """The file of a service: what belongs to the computer, and not to one of the machines on it.
 
 ``service.toml`` beside machine files holds for all of them. A table that a machine file has itself stands in place of
-that table, for its machine alone. ``docs/reference/service-file.md`` explains every key; paths are relative to the file.
+that table, for its machine alone. Paths are relative to the file. ``docs/reference/service-file.md`` explains each key.
 """
 
 import os

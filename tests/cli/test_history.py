@@ -243,6 +243,28 @@ def test_commands_of_root_use_the_state_of_the_service(
     assert len(list((common.SERVICES / "line-7" / "components").glob("*.decisions.json"))) == 1
 
 
+def test_commands_of_root_use_the_state_of_the_hall(
+    service: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """By the file of a machine, by the name of the file, and by that of the machine."""
+    state = common.SERVICES / common.HALL
+    state.mkdir()
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))
+    request.getfixturevalue("written")
+    expected = run(MACHINE, "--since", "1d").output
+    service.unlink()
+    file = common.INSTALLED / common.HALL / "line-8.toml"
+    file.parent.mkdir()
+    names = f'[machine]\nname = "{MACHINE}"\nsite = "{SITE}"\n[twin]'
+    rest = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8").partition("[twin]")[2]
+    file.write_text(names + rest, encoding="utf-8")
+    shutil.copytree(EXAMPLES / "scenarios", file.parent / "scenarios")
+    for text in ("line-8", MACHINE, f"{SITE}.{MACHINE}", str(file)):
+        monkeypatch.delenv("STATE_DIRECTORY")
+        assert run(text, "--since", "1d").output == expected != ""
+        assert common.restart_command(file) == "systemctl restart otolith"
+
+
 def test_a_command_that_may_not_use_the_state_of_the_service_says_so(
     service: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,11 +12,12 @@ from click.testing import CliRunner
 
 from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
-from otolith.cli.operation.install import UNIT, _run, drop_in, named_files
+from otolith.cli.operation.install import HALL_UNIT, UNIT, _commands, _run, drop_in, named_files
+from otolith.machine import load_machine
 from otolith_drivers.canbus import bus as can_bus
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.conftest import EXAMPLES
-from tests.messages import raises_saying
+from tests.messages import assert_says, raises_saying
 
 LOOPBACK = ("tcp/127.0.0.1:7447",)
 
@@ -126,7 +127,7 @@ def test_a_program_that_the_service_may_not_run_is_named(tmp_path: Path) -> None
     program = Path(shutil.copy("/bin/true", tmp_path / "otolith"))
     tmp_path.chmod(0o700)
     with raises_saying(ServiceError, f"{program}", "'daemon'", "run"):
-        _run([str(program)], "daemon", "press-3")
+        _run([str(program)], "daemon")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to a group")
@@ -216,14 +217,127 @@ def test_each_shipped_machine_file_is_exposed_at_most_1_0(
 
 
 def exposure(root: Path, name: str) -> float:
-    """Exposure of the installed instance ``name``, from 0 to 10."""
+    """Exposure of the installed unit or instance ``name``, from 0 to 10."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze here")
-    command = ["systemd-analyze", "security", "--offline=yes", f"--root={root}", f"otolith@{name}.service"]
+    unit = name if name.endswith(".service") else f"otolith@{name}.service"
+    command = ["systemd-analyze", "security", "--offline=yes", f"--root={root}", unit]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     exposure = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
     assert exposure is not None, done.stderr
     return float(exposure[1])
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Path:
+    """A directory with two machines, one of them on a serial line, and a file of the service."""
+    folder = tmp_path / "machines"
+    folder.mkdir()
+    for name in ("dc-motor.toml", "dc-motor.dbc", "pump-vfd.toml"):
+        shutil.copy(EXAMPLES / name, folder)
+    (folder / "service.toml").write_text('[zenoh]\nlisten = ["tcp/127.0.0.1:7450"]\n', encoding="utf-8")
+    return folder
+
+
+def test_a_directory_is_one_service(hall: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    names = {f"etc/otolith/hall/{path.name}" for path in hall.iterdir()}
+    names |= {f"etc/systemd/system/{HALL_UNIT}", "etc/systemd/system/otolith.service.d/machine.conf"}
+    names |= {"usr/lib/sysusers.d/otolith.conf"}
+    output = installed(hall, root)
+    assert {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} == names
+    assert "compile /etc/otolith/hall\n" in output
+    assert output.endswith("systemctl enable --now otolith\n")
+    assert installed(hall, root).count("unchanged: ") == len(names)
+    text = (root / "etc/systemd/system/otolith.service.d/machine.conf").read_text(encoding="utf-8")
+    for file in ("dc-motor.toml", "pump-vfd.toml"):
+        needed = {drop for drop in drop_in_of(hall / file) if "Allow=" in drop}
+        assert needed <= set(text.splitlines()), file
+    sockets = [line for line in text.splitlines() if line.startswith("RestrictAddressFamilies=AF")]
+    assert sockets == ["RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6"]
+
+
+def drop_in_of(file: Path) -> list[str]:
+    machine = load_machine(file).file
+    return drop_in(file.stem, machine.drivers, machine.zenoh.listen, machine.zenoh.connect).splitlines()
+
+
+def test_the_unit_of_a_hall_is_as_strict_as_that_of_a_machine(hall: Path, tmp_path: Path) -> None:
+    """It differs in paths and in what grows with the number of machines."""
+    alone, several = (
+        dict.fromkeys((shipped_directory("systemd") / unit).read_text(encoding="utf-8").splitlines())
+        for unit in (UNIT, HALL_UNIT)
+    )
+    differing = {line.partition("=")[0] for line in {*alone} ^ {*several} if not line.startswith("#")}
+    own = {"Description", "ExecStart", "StateDirectory", "RuntimeDirectory"}
+    assert differing == {*own, "TimeoutStartSec", "TimeoutStopSec", "LimitNOFILE", "MemoryMax"}
+    installed(hall, tmp_path / "both")
+    assert exposure(tmp_path / "both", "otolith.service") <= 1.2  # a device and IP addresses
+    (hall / "pump-vfd.toml").unlink()
+    installed(hall, tmp_path / "network")
+    assert exposure(tmp_path / "network", "otolith.service") <= 1.0
+
+
+def test_services_share_one_cache_of_kernels() -> None:
+    for unit in (UNIT, HALL_UNIT):
+        text = (shipped_directory("systemd") / unit).read_text(encoding="utf-8")
+        assert "\nCacheDirectory=otolith\nCacheDirectoryMode=0700\n" in text
+        command, user = _commands(Path("/etc/otolith/press-3.toml"), [], [])[-2]
+        assert (command[-1], command[command.index("-m") + 1], user) == ("/var/cache/otolith", "0700", None)
+
+
+def test_readers_of_one_machine_of_a_hall_whose_networks_are_not_known_are_not_shut_out(
+    hall: Path, tmp_path: Path
+) -> None:
+    table = '[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]\naccess = {{ networks = {} }}\n'
+    conf = "etc/systemd/system/otolith.service.d/machine.conf"
+    motor = hall / "dc-motor.toml"
+    (hall / "pump-vfd.toml").unlink()
+    whole = motor.read_text(encoding="utf-8")
+    motor.write_text(whole + table.format('["192.168.7.0/24"]'), encoding="utf-8")
+    installed(hall, tmp_path / "known")
+    assert "IPAddressAllow=192.168.7.0/24" in (tmp_path / "known" / conf).read_text(encoding="utf-8")
+    shutil.copy(motor, hall / "other.toml")
+    (hall / "other.toml").write_text(
+        whole.replace('"dc-motor"', '"other"', 1) + '[zenoh]\nlisten = ["tcp/0.0.0.0:1"]\n'
+    )
+    installed(hall, tmp_path / "unknown")
+    assert "\nIPAddressDeny" not in (tmp_path / "unknown" / conf).read_text(encoding="utf-8")
+
+
+def test_a_machine_is_not_installed_twice_silently(hall: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    assert "warning" not in installed(hall, root)
+    shutil.copy(hall / "dc-motor.toml", tmp_path / "press-3.toml")
+    shutil.copy(hall / "dc-motor.dbc", tmp_path)
+    output = installed(tmp_path / "press-3.toml", root)
+    assert_says(output, "warning", "etc/otolith/hall/dc-motor.toml", "same machine", "disable otolith")
+    assert_says(installed(hall, root), "warning", "etc/otolith/press-3.toml", "disable otolith@press-3")
+    (hall / "dc-motor.toml").unlink()
+    assert_says(installed(hall, root), "warning", "etc/otolith/hall/dc-motor.toml", "delete it")
+
+
+def test_the_file_of_the_service_that_is_there_holds_for_a_machine_that_is_added(file: Path, tmp_path: Path) -> None:
+    there = tmp_path / "root" / "etc/otolith/service.toml"
+    there.parent.mkdir(parents=True)
+    there.write_text('[zenoh]\nlisten = ["tcp/0.0.0.0:7450"]\n', encoding="utf-8")
+    installed(file, tmp_path / "root")
+    conf = tmp_path / "root" / "etc/systemd/system/otolith@press-3.service.d/machine.conf"
+    assert "AF_INET " in conf.read_text(encoding="utf-8")
+    assert "\nIPAddressDeny" not in conf.read_text(encoding="utf-8")
+
+
+def test_a_wrong_file_of_a_directory_installs_nothing(hall: Path, file: Path, tmp_path: Path) -> None:
+    (hall / "service.toml").write_text("[history]\ndays = 0\n", encoding="utf-8")
+    with raises_saying(ConfigurationError, "service.toml:2", "history.days"):
+        installed(hall, tmp_path / "root")
+    for path in hall.glob("*.toml"):
+        path.unlink()
+    with raises_saying(ConfigurationError, str(hall), "no machine file"):
+        installed(hall, tmp_path / "root")
+    with raises_saying(ConfigurationError, "hall.toml", "another name"):
+        installed(file.rename(tmp_path / "hall.toml"), tmp_path / "root")
+    assert not (tmp_path / "root").exists()
 
 
 def test_a_wrong_machine_file_installs_nothing(file: Path, tmp_path: Path) -> None:

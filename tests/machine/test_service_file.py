@@ -1,6 +1,7 @@
 """``service.toml``: what belongs to the computer, beside the machine files for which it holds."""
 
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from otolith.machine import load_machine
 from otolith.publishing.zenoh_config import Access
 from otolith.runtime.hall.changes import changes_of_hall
 from otolith.runtime.hall.files import files_in, read_files
-from otolith.service_file import workers_of
+from otolith.service_file import ServiceFile, ServiceTable, service_file_in, workers_of
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
@@ -151,3 +152,16 @@ def test_tables_of_the_service_in_machine_files_are_told_once(
         assert serve([folder], None, None, None) == 0
     (line,) = [record.getMessage() for record in caplog.records if record.name == "otolith.cli.run"]
     assert_says(line, "[history]", "one.toml", "two.toml", "service.toml")
+
+
+def test_every_key_of_the_service_is_listed() -> None:
+    """Those of the other tables are listed for the machine file."""
+    page = (Path(__file__).parents[2] / "docs/reference/service-file.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `\[(\w+)\]` \|", page, re.MULTILINE)) == set(ServiceFile.model_fields)
+    assert set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)) == set(ServiceTable.model_fields)
+
+
+def test_the_shipped_example_is_one() -> None:
+    example = service_file_in(EXAMPLES / "hall")
+    assert example is not None
+    assert example.recording.max_gigabytes == 2.0

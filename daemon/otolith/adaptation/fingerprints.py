@@ -28,6 +28,13 @@ def configuration_fingerprint(problem: Problem) -> str:
     return _hash([free, known, noise, problem.open_loop])
 
 
+def kernels_fingerprint(problem: Problem) -> str:
+    """Return a hash of what the kernels of a first window depend on: twin, free parameters, kinds of noise."""
+    free = [item.name for item in problem.free]
+    noise = [[level > 0.0 for level in levels] for levels in (problem.input_noise, problem.process_noise)]
+    return _hash([twin_fingerprint(problem.twin), free, noise, problem.open_loop, problem.discover])
+
+
 def values_fingerprint(problem: Problem) -> str:
     """Return a hash of the values of the known parameters, with which a component is found."""
     return _hash([pair for pair in problem.known if not pair[0].startswith("_")])

@@ -19,8 +19,9 @@ import click
 from otolith.cli.terminal import JournalFormatter, LogFormatter, echo
 from otolith_drivers.errors import ServiceError
 
-SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
-INSTALLED = Path("/etc/otolith")  # their machine files
+SERVICES = Path("/var/lib/otolith")  # state directories of the services: systemd/otolith@.service, otolith.service
+INSTALLED = Path("/etc/otolith")  # machine files of the instances of otolith@.service
+HALL = "hall"  # folder of the machine files of otolith.service in INSTALLED, and of their state in SERVICES
 DEMOS = "demo"  # folder in the state directory with one for each demo, whose names sort by time
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
 STEP_TIMEOUT, BREAK_INTERVAL = 2.0, 0.5  # s until a step is broken off after a signal; until that is tried again
@@ -43,6 +44,13 @@ def _machine_paths(_: click.Context, __: click.Parameter, given: tuple[str, ...]
 
 
 MACHINE_FILE = click.argument("file", metavar="FILE|MACHINE", callback=_machine_file)
+
+
+def _machine_or_folder(_: click.Context, __: click.Parameter, given: str) -> Path:
+    return _machine_paths(_, __, (given,))[0]
+
+
+MACHINE_OR_FOLDER = click.argument("path", metavar="FILE|MACHINE|DIRECTORY", callback=_machine_or_folder)
 MACHINES = click.argument("paths", metavar="PATH...", nargs=-1, required=True, callback=_machine_paths)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
@@ -52,10 +60,9 @@ def use_state_of_service(machine: Path | str) -> bool:
 
     A ``STATE_DIRECTORY`` that is set is kept. Raises ServiceError if this user may not.
     """
-    is_file = isinstance(machine, Path)
-    folder = SERVICES / (machine.stem if isinstance(machine, Path) else machine)
-    is_installed = not is_file or Path(machine).absolute().parent == INSTALLED
-    if not is_installed or "STATE_DIRECTORY" in os.environ or not folder.is_dir():
+    name = service_of(machine) if isinstance(machine, Path) else machine
+    folder = SERVICES / (name or "")
+    if not name or "STATE_DIRECTORY" in os.environ or not folder.is_dir():
         return False
     if not os.access(folder, os.W_OK):
         raise ServiceError(f"{folder}: state of a service, which root and its own user may read: try it with sudo")
@@ -63,10 +70,16 @@ def use_state_of_service(machine: Path | str) -> bool:
     return True
 
 
+def service_of(machine: Path) -> str:
+    """Return the name of the service with this machine file, as its folder of state has it; empty if it is none."""
+    folder = machine.absolute().parent
+    return machine.stem if folder == INSTALLED else HALL if folder == INSTALLED / HALL else ""
+
+
 def restart_command(machine: Path) -> str:
     """Return how the daemon of a machine file is started again."""
-    if machine.absolute().parent == INSTALLED:
-        return f"systemctl restart otolith@{machine.stem}"
+    if name := service_of(machine):
+        return f"systemctl restart otolith{'' if name == HALL else f'@{name}'}"
     return f"stop the daemon, then 'otolith run {machine}'"
 
 

@@ -56,7 +56,9 @@ def identity_of(path: Path) -> MachineIdentity | None:
 
 def services() -> dict[Path, MachineIdentity]:
     """Return the machine files of the services that this user may read."""
-    files = sorted(common.INSTALLED.glob("*.toml")) if os.access(common.INSTALLED, os.R_OK | os.X_OK) else []
+    folders = (common.INSTALLED, common.INSTALLED / common.HALL)
+    readable = [folder for folder in folders if os.access(folder, os.R_OK | os.X_OK)]
+    files = [path for folder in readable for path in sorted(folder.glob("*.toml"))]
     return {path: identity for path in files if (identity := identity_of(path)) is not None}
 
 
@@ -128,8 +130,9 @@ def reader_of(text: str) -> "HistoryReader":
     if (reader := _own_reader(text)) is not None:
         return reader
     service = service_file(text)
-    if common.use_state_of_service(service.stem if service else text):
-        return reader_of(text)
+    if common.use_state_of_service(service or text):
+        is_in_hall = service is not None and common.service_of(service) == common.HALL
+        return reader_of(services()[service].key if service is not None and is_in_hall else text)
     if not (demos := _demos_of(text)):
         raise ConfigurationError(none_text(text, "history"))
     echo(f"no machine is named {text!r}: this is the demo in {demos[-1].path.parents[1]}", err=True)

@@ -157,7 +157,7 @@ def cli() -> None:
 @click.option("--recording", type=FILE, callback=_new_recording,
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
 @click.option("--workers", type=click.IntRange(1), metavar="NUMBER",
-              help="Processes that compute for several machines; as many as processors without it.")  # fmt: skip
+              help="Processes that compute for several machines, in place of service.toml's.  [default: one per processor]")  # fmt: skip
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 def run(
     paths: tuple[Path, ...], listen: tuple[str, ...], recording: Path | None, workers: int | None, verbose: bool
@@ -334,28 +334,33 @@ def watch(
 
 
 @cli.command("compile")
-@MACHINE_FILE
-def compile_command(file: Path) -> None:
-    """Compile the twin of the machine in FILE before it is needed.
+@MACHINES
+def compile_command(paths: tuple[Path, ...]) -> None:
+    """Compile the twins of the machines in PATH before they are needed: machine files, names, or directories of files.
 
     The kernels go into the cache of this user. 'otolith run' compiles what is missing there, during which it reports
     nothing; so does 'otolith install' for the service.
 
     \b
-    Example:
+    Examples:
       otolith compile config/dc-motor.toml
+      otolith compile /etc/otolith/hall
     """
     from otolith import kernel_cache
+    from otolith.adaptation.fingerprints import kernels_fingerprint
     from otolith.adaptation.state import initial_state
     from otolith.machine import load_machine
+    from otolith.runtime.hall.files import files_in
     from otolith.runtime.worker import WARM_UP_KERNELS, warm_up
-    from otolith_drivers.errors import ServiceError, counted
+    from otolith_drivers.errors import ConfigurationError, ServiceError, counted
     from otolith_drivers.user_dirs import cache_directory
 
-    machine, begun = load_machine(file, with_driver=False), time.monotonic()
-    machine.try_fmu()
+    machines, begun = [load_machine(file, with_driver=False) for file in files_in(paths)], time.monotonic()
+    if not machines:
+        raise ConfigurationError(f"{', '.join(map(str, paths))}: there is no machine file (*.toml)")
     folder, count, done = cache_directory("kernels"), 0, 0
-    with progress_line(f"compiling {machine.twin.name}") as show:
+    failures = []
+    with progress_line(f"compiling {machines[0].twin.name}") as show:
 
         def observe(step: kernel_cache.CompileStep) -> None:
             nonlocal count, done
@@ -363,11 +368,15 @@ def compile_command(file: Path) -> None:
             took = f"{time.monotonic() - begun:.0f} s"
             show(f"compiling {step.kernel}, {done} of {max(done, WARM_UP_KERNELS)} kernels done in {took}")
 
-        identity = machine.file.machine
-        with kernel_cache.observed(observe):
-            failure = warm_up(initial_state(identity.name, identity.site, machine.problem, machine.plan))
-    if failure:
-        raise ServiceError(f"{file}: twin {machine.twin.name!r} cannot be compiled or run: {failure}")
+        for machine in {kernels_fingerprint(machine.problem): machine for machine in machines}.values():
+            machine.try_fmu()
+            identity, done = machine.file.machine, 0
+            with kernel_cache.observed(observe):
+                failure = warm_up(initial_state(identity.name, identity.site, machine.problem, machine.plan))
+            if failure:
+                failures.append(f"{machine.path}: twin {machine.twin.name!r} cannot be compiled or run: {failure}")
+    if failures:
+        raise ServiceError("\n".join(failures))
     if count:
         echo(f"compiled {counted(count, 'kernel')} in {time.monotonic() - begun:.0f} s: {folder}")
     else:

@@ -1,4 +1,4 @@
-"""``otolith install``: the service of one machine, step by step.
+"""``otolith install``: the service of one machine, or of all in a directory, step by step.
 
 Each step of the installation is idempotent, and shown by ``--dry-run``.
 """
@@ -13,21 +13,25 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import click
 
-from otolith.cli.common import MACHINE_FILE, shipped_directory
+from otolith.cli.common import HALL, MACHINE_OR_FOLDER, shipped_directory
 from otolith.cli.operation.unit_file import addresses, comment, directive
 from otolith.cli.terminal import echo
 from otolith_drivers.errors import ConfigurationError, ServiceError, shown, some_names
 
-UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
+if TYPE_CHECKING:
+    from otolith.machine import LoadedMachine
+    from otolith.machine_file import ZenohTable
+
+UNIT, HALL_UNIT, SYSUSERS = "otolith@.service", "otolith.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
 Table = Mapping[str, Any]
 Endpoints = Sequence[str]  # of Zenoh
-USER, ETC = "otolith", Path("etc/otolith")
+USER, ETC, CACHE = "otolith", Path("etc/otolith"), "/var/cache/otolith"
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
 # Interfaces of python-can that need a bus of the kernel, multicast, or the serial port that the channel names.
@@ -43,62 +47,163 @@ class InstalledFile:
     is_private: bool = False  # Readable by root and the service only
 
 
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The service of one machine, or of the machines in a directory."""
+
+    source: Path
+    files: tuple[Path, ...]  # Of the machines
+
+    @property
+    def is_hall(self) -> bool:
+        """Whether it is that of a directory."""
+        return self.source.is_dir()
+
+    @property
+    def unit(self) -> str:
+        """Name of its unit."""
+        return "otolith" if self.is_hall else f"otolith@{self.source.stem}"
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its machine files."""
+        return ETC / HALL if self.is_hall else ETC
+
+    @property
+    def compiled(self) -> Path:
+        """What it runs."""
+        return Path("/") / (self.folder if self.is_hall else self.folder / self.source.name)
+
+
 @click.command()
-@MACHINE_FILE
+@MACHINE_OR_FOLDER
 @click.option("--dry-run", is_flag=True, help="Only print the steps.")
 @click.option("--root", type=click.Path(path_type=Path, file_okay=False), default=Path("/"),
               help="Put the files under this folder, and run no command.")  # fmt: skip
-def install(file: Path, dry_run: bool, root: Path) -> None:
-    """Install the service of the machine in FILE, as root.
+def install(path: Path, dry_run: bool, root: Path) -> None:
+    """Install the service of the machine in FILE, or of all machines in DIRECTORY, as root.
 
-    It copies the unit, what the unit may access, and FILE with the files that it names, makes the user 'otolith', and
-    compiles the twin. It starts nothing. Repeat it after an upgrade or a change of FILE.
+    It copies the unit, what the unit may access, and the files with those that they name, makes the user 'otolith', and
+    compiles the twins. It starts nothing. Repeat it after an upgrade or a change of a file.
 
     \b
     Examples:
       otolith install --dry-run press-3.toml
       sudo /opt/otolith/bin/otolith install press-3.toml
+      sudo /opt/otolith/bin/otolith install machines/
     """
     is_here = root == Path("/")
     if is_here and not dry_run and os.geteuid() != 0:
         raise ServiceError("install needs root: use sudo, or --root DIR to look at the files, or --dry-run")
-    files = list(_files(file))
+    target = _target(path)
+    files = list(_files(target, root))
     read = [folder for item in files for folder in item.path.parents if ETC in (folder, *folder.parents)]
-    closed = closed_folders([*read, Path("var/lib/otolith"), Path("var/cache/otolith")], root)
+    closed = closed_folders(list(dict.fromkeys([*read, Path("var/lib/otolith"), Path("var/cache/otolith")])), root)
+    own = {file.name for file in target.files}
     for item in files:
-        others = [other.name for other in _machines_with(root / item.path, root / ETC) if other.name != file.name]
+        others = [other.name for other in _machines_with(root / item.path, root / target.folder)]
+        others = [name for name in others if name not in own]
         if _put(item, root, dry_run=dry_run) and others:
             remedy = "if they need another one, give this file another name"
-            echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
+            echo(f"warning: {root / item.path} is also a file of {some_names(others)}: {remedy}", err=True)
+    for warning in _warnings(target, root):
+        echo(f"warning: {warning}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
-    for command, user in _commands(file.stem, private, closed):
+    for command, user in _commands(target.compiled, private, closed):
         echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
         if is_here and not dry_run:
-            _run(command, user, file.stem)
+            _run(command, user)
     if not PROGRAM.exists():
         echo(f"missing: {PROGRAM}, which the unit starts: make the environment /opt/otolith first", err=True)
-    echo(f"start it: systemctl enable --now otolith@{file.stem}")
+    echo(f"start it: systemctl enable --now {target.unit}")
 
 
-def _files(file: Path) -> Iterator[InstalledFile]:
-    """Yield the files of the service of one machine; raise ConfigurationError if its file or its name is wrong."""
+def _target(path: Path) -> Target:
+    """Return the service of a machine file or a directory; raise ConfigurationError if its name does not fit."""
+    from otolith.runtime.hall.files import files_in
+
+    if path.is_dir():
+        if not (files := files_in([path])):
+            raise ConfigurationError(f"{path}: there is no machine file (*.toml)")
+        return Target(path, tuple(files))
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", path.stem) or path.suffix != ".toml":
+        raise ConfigurationError(f"{path}: its name becomes that of the service: use letters, digits, '_', '-', .toml")
+    if path.stem == HALL:
+        raise ConfigurationError(f"{path}: {HALL!r} is the name of the service of a directory: give it another name")
+    return Target(path, (path,))
+
+
+def _files(target: Target, root: Path) -> Iterator[InstalledFile]:
+    """Yield the files of a service; raise ConfigurationError if a machine file, or that of the service, is wrong."""
     from otolith.machine import load_machine
+    from otolith.service_file import SERVICE_FILE
 
-    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", file.stem) or file.suffix != ".toml":
-        raise ConfigurationError(f"{file}: its name becomes that of the service: use letters, digits, '_', '-', .toml")
-    machine = load_machine(file)
+    machines = [load_machine(file) for file in target.files]
     shipped, etc = shipped_directory("systemd"), ETC.parent
-    yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
+    template = HALL_UNIT if target.is_hall else UNIT
+    yield InstalledFile(etc / "systemd/system" / template, (shipped / template).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
-    zenoh = machine.file.zenoh
-    command = bool(machine.file.machine.on_event)
-    networks = zenoh.access.networks
-    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command, networks=networks)
-    yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
-    for name in [Path(file.name), *named_files(file)]:
-        source = file.parent / name
+    zenoh = [_zenoh_there(machine, root / target.folder) for machine in machines]
+    text = drop_in(
+        f"{HALL}/*" if target.is_hall else target.source.stem,
+        [driver for machine in machines for driver in machine.file.drivers],
+        list(dict.fromkeys(endpoint for table in zenoh for endpoint in table.listen)),
+        list(dict.fromkeys(endpoint for table in zenoh for endpoint in table.connect)),
+        command=any(machine.file.machine.on_event for machine in machines),
+        networks=_networks(zenoh),
+    )
+    yield InstalledFile(etc / f"systemd/system/{target.unit}.service.d/machine.conf", text.encode())
+    files, folder = list(target.files), target.files[0].parent
+    if (folder / SERVICE_FILE).exists():
+        files.append(folder / SERVICE_FILE)
+    names = [name for file in files for name in (Path(file.name), *named_files(file))]
+    for name in dict.fromkeys(names):
+        source = folder / name
         is_private = not source.stat().st_mode & 0o004
-        yield InstalledFile(ETC / name, source.read_bytes(), is_private)
+        yield InstalledFile(target.folder / name, source.read_bytes(), is_private)
+
+
+def _zenoh_there(machine: "LoadedMachine", folder: Path) -> "ZenohTable":
+    """Return the table that a machine has once it is in ``folder``, where a file of the service may be already."""
+    from otolith.service_file import service_file_in
+
+    is_own = "zenoh" in machine.file.model_fields_set
+    there = None if is_own else service_file_in(folder)
+    return machine.file.zenoh if there is None else there.zenoh
+
+
+def _networks(tables: "Sequence[ZenohTable]") -> list[str] | None:
+    """Return the networks of the readers of several machines; None if those of one that listens are not known."""
+    from otolith.machine_file import address_of, host_of
+
+    hosts = {table: [host for endpoint in table.listen if (host := host_of(endpoint))] for table in tables}
+    listening = [
+        table
+        for table, found in hosts.items()
+        if any((address := address_of(host)) is None or not address.is_loopback for host in found)
+    ]
+    if any(table.access.networks is None for table in listening):
+        return None
+    return list(dict.fromkeys(network for table in listening for network in table.access.networks or ()))
+
+
+def _warnings(target: Target, root: Path) -> Iterator[str]:
+    """Yield what is to be known of machine files that are installed already."""
+    from otolith.cli.machines import identity_of
+    from otolith.service_file import SERVICE_FILE
+
+    if target.is_hall:
+        own = {file.name for file in target.files}
+        left = [path for path in sorted((root / target.folder).glob("*.toml")) if path.name not in {*own, SERVICE_FILE}]
+        yield from (f"{path} is not in {target.source}, and stays: delete it to end its machine" for path in left)
+    other = root / (ETC if target.is_hall else ETC / HALL)
+    named = {identity: path for path in sorted(other.glob("*.toml")) if (identity := identity_of(path))}
+    for file in target.files:
+        if (identity := identity_of(file)) in named:
+            also = named[identity]
+            unit = f"otolith@{also.stem}" if target.is_hall else "otolith"
+            remedy = f"only one service may run it: disable {unit}, or delete this file"
+            yield f"{also} is of the same machine, {identity.key}: {remedy}"
 
 
 def named_files(file: Path) -> list[Path]:
@@ -245,24 +350,24 @@ def closed_folders(folders: Sequence[Path], root: Path) -> list[str]:
     return list(closed)
 
 
-def _commands(name: str, private: list[str], closed: list[str]) -> list[tuple[list[str], str | None]]:
+def _commands(compiled: Path, private: list[str], closed: list[str]) -> list[tuple[list[str], str | None]]:
     """Return the commands of an installation, each with the user who runs it, root if None.
 
     The group of the service may enter ``closed`` folders afterwards, and nobody else.
     """
-    cache, program = f"/var/cache/otolith/{name}", str(PROGRAM if PROGRAM.exists() else Path(sys.argv[0]).absolute())
+    program = str(PROGRAM if PROGRAM.exists() else Path(sys.argv[0]).absolute())
     return [
         (["systemd-sysusers"], None),
         *([(["chgrp", USER, *private, *closed], None)] if private or closed else []),
         *([(["chmod", "g+x", *closed], None)] if closed else []),
         (["systemctl", "daemon-reload"], None),
-        (["install", "-d", "-m", "0700", "-o", USER, "-g", USER, cache], None),
-        ([program, "compile", f"/etc/otolith/{name}.toml"], USER),
+        (["install", "-d", "-m", "0700", "-o", USER, "-g", USER, CACHE], None),
+        ([program, "compile", str(compiled)], USER),
     ]
 
 
-def _run(command: list[str], user: str | None, name: str) -> None:
-    environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": f"/var/cache/otolith/{name}"}
+def _run(command: list[str], user: str | None) -> None:
+    environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": CACHE}
     extra_groups = None if user is None else ()
     try:
         done = subprocess.run(  # noqa: S603 - the commands above, without a shell
