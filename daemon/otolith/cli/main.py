@@ -157,7 +157,7 @@ def cli() -> None:
 @click.option("--recording", type=FILE, callback=_new_recording,
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
 @click.option("--workers", type=click.IntRange(1), metavar="NUMBER",
-              help="Processes that compute for several machines, in place of service.toml's.  [default: one per processor]")  # fmt: skip
+              help="Processes that compute for several machines.  [default: one per processor]")  # fmt: skip
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 def run(
     paths: tuple[Path, ...], listen: tuple[str, ...], recording: Path | None, workers: int | None, verbose: bool
@@ -336,8 +336,9 @@ def watch(
 @cli.command("compile")
 @MACHINES
 def compile_command(paths: tuple[Path, ...]) -> None:
-    """Compile the twins of the machines in PATH before they are needed: machine files, names, or directories of files.
+    """Compile the twins of the machines in PATH.
 
+    PATH is a machine file, the name of a machine, or a directory of machine files.
     The kernels go into the cache of this user. 'otolith run' compiles what is missing there, during which it reports
     nothing; so does 'otolith install' for the service.
 

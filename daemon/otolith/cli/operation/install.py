@@ -81,7 +81,7 @@ class Target:
 @click.option("--root", type=click.Path(path_type=Path, file_okay=False), default=Path("/"),
               help="Put the files under this folder, and run no command.")  # fmt: skip
 def install(path: Path, dry_run: bool, root: Path) -> None:
-    """Install the service of the machine in FILE, or of all machines in DIRECTORY, as root.
+    """Install the service of a machine, or of a hall, as root.
 
     It copies the unit, what the unit may access, and the files with those that they name, makes the user 'otolith', and
     compiles the twins. It starts nothing. Repeat it after an upgrade or a change of a file.
