@@ -28,7 +28,7 @@ if [ "${1:-}" = --sandbox-and-can ]; then
     tests/vm/test_life.py::test_nobody_else_reads_or_publishes tests/vm/test_life.py::test_the_sandbox_is_tight
   exit $code
 fi
-SECONDS_AT_MOST=1800 boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py \
+SECONDS_AT_MOST=1800 boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_hall.py \
   tests/vm/test_network.py tests/vm/test_life.py tests/vm/test_troubles.py tests/vm/test_boots.py::test_before_a_reboot
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_reboot '&&' python -m tests.vm.cut_power
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_power_cut

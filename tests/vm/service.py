@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -67,9 +68,8 @@ class Instance:
     def install(self, source: Path) -> None:
         """As the README says; /opt/otolith is there already. Kernels that are compiled are taken over."""
         run("systemd-sysusers", str(ROOT / "systemd" / "otolith.sysusers.conf"))
-        compiled, cache = Path.home() / ".cache" / "otolith", Path("/var/cache/otolith") / self.name
+        compiled, cache = Path.home() / ".cache" / "otolith", Path("/var/cache/otolith")
         if compiled.exists() and not cache.exists():
-            cache.parent.mkdir(exist_ok=True)
             shutil.copytree(compiled, cache)
             run("chown", "--recursive", "otolith:otolith", str(cache))
         run(PROGRAM, "install", str(source), seconds=900.0)
@@ -85,7 +85,7 @@ class Instance:
         return done.stdout
 
     def history(self) -> HistoryReader:
-        """The history of its machine."""
+        """The history of its machine, the only one."""
         (path,) = self.state.rglob("*.history.sqlite")
         return HistoryReader(path)
 
@@ -143,6 +143,26 @@ class Instance:
                 return reports[place:]
             last = report.window.index
         return []
+
+
+class Hall(Instance):
+    """The service of several machines."""
+
+    def __init__(self) -> None:
+        super().__init__("hall")
+        self.unit, self.file = "otolith", Path("/etc/otolith/hall")
+
+    def wait_for_all(self, names: Collection[str]) -> None:
+        """Wait until each of the machines has a report in its history."""
+        deadline = time.monotonic() + 2 * PATIENCE
+        while self._told() < set(names):
+            assert not (why := self.failure()), why
+            assert time.monotonic() < deadline, self.log()
+            time.sleep(0.5)
+
+    def _told(self) -> set[str]:
+        readers = [HistoryReader(path) for path in self.state.rglob("*.history.sqlite")]
+        return {reader.machine for reader in readers if reader.messages("report", 1)}
 
 
 def holds_truth(report: ReportDocument) -> None:
