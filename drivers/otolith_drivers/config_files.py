@@ -224,6 +224,15 @@ def expect(file: SourceFile, data: dict[str, Any], key: str) -> None:
             raise ConfigurationError(f"{file.path}: this is {kind}, for '{command}'; {KINDS[key][0]} is needed here")
 
 
+def is_of_another_kind(path: Path, key: str) -> bool:
+    """Whether a TOML file is known to be of another kind than that with ``key``; not so if it cannot be read."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return key not in data and any(other in data for other in KINDS)
+
+
 def validate(data: Any, model: type[Model], file: SourceFile, under: Location = ()) -> Model:
     """Return ``data``, at location ``under`` of the file, as ``model``; the ConfigurationError has a line per fault."""
     try:

@@ -8,7 +8,7 @@ import pytest
 
 from otolith.cli.commissioning.complete_file import complete_lines
 from otolith.cli.run import serve
-from otolith.machine import load_machine
+from otolith.machine import LIBRARY, load_machine
 from otolith.publishing.zenoh_config import Access
 from otolith.runtime.hall.changes import changes_of_hall
 from otolith.runtime.hall.files import files_in, read_files
@@ -112,6 +112,15 @@ def test_the_file_of_the_service_is_no_machine(folder: Path) -> None:
         (folder / "service.toml").write_text(text, encoding="utf-8")
         with raises_saying(ConfigurationError, "service.toml", "the file of a service", "otolith run DIRECTORY"):
             load_machine(folder / "service.toml")
+
+
+def test_twins_and_scenarios_beside_machine_files_are_no_machines(folder: Path) -> None:
+    """They were told as machines at NO DATA."""
+    (folder / "pump-twin.toml").write_bytes((LIBRARY / "pump.toml").read_bytes())
+    (folder / "plant.toml").write_bytes((EXAMPLES / "scenarios/demo.toml").read_bytes())
+    (folder / "unfinished.toml").write_text("[machine", encoding="utf-8")
+    (folder / "empty.toml").write_text("", encoding="utf-8")
+    assert [each.path.name for each in read_files([folder]).refused] == ["empty.toml", "unfinished.toml"]
 
 
 def test_a_folder_with_the_service_file_alone_has_no_machine(folder: Path) -> None:

@@ -12,6 +12,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.machine_file import MachineTable, check_name
 from otolith.service_file import SERVICE_FILE
 from otolith.storage.state_store import is_served
+from otolith_drivers.config_files import is_of_another_kind
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,9 @@ def files_in(paths: Sequence[Path]) -> list[Path]:
 
 
 def _machine_files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*.toml") if path.name != SERVICE_FILE)
+    """Return the machine files of a folder, where twins, scenarios and the file of the service may lie as well."""
+    files = (path for path in folder.glob("*.toml") if path.name != SERVICE_FILE)
+    return sorted(path for path in files if not is_of_another_kind(path, "machine"))
 
 
 def read_files(paths: Sequence[Path], served: Collection[Path] = ()) -> MachineFiles:
