@@ -21,27 +21,19 @@ from otolith.fmu_twin import VARIABLES, Variables
 from otolith.health.diagnosis import OwnRule
 from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
+from otolith.outlet_tables import MachineOutletsTable
 from otolith.twin.definition import Definition
 from otolith.twin.language import OwnFigureTable
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.time_zones import check_time_zone
-from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
+from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, check_name, validate
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.sources import SeveralSources
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
 LOCAL = "local"  # The socket of the machine on this computer, instead of an endpoint to listen on
-
-
-def check_name(text: str) -> str:
-    """Return ``text``, or raise ValueError if it is no valid name."""
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", text):
-        raise ValueError(
-            f"{text!r} is not a valid name: use 1 to 64 letters, digits, '-' and '_', and begin with a letter or digit"
-        )
-    return text
 
 
 def _endpoint(text: str) -> str:
@@ -306,6 +298,7 @@ class MachineFile(StrictModel):
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
     evidence: EvidenceTable = EvidenceTable()
+    outlets: MachineOutletsTable = MachineOutletsTable()
 
     @property
     def drivers(self) -> tuple[dict[str, Any], ...]:

@@ -265,6 +265,15 @@ def written_as(pattern: re.Pattern[str], what: str) -> AfterValidator:
     return AfterValidator(validated_text)
 
 
+def check_name(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no valid name."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", text):
+        raise ValueError(
+            f"{text!r} is not a valid name: use 1 to 64 letters, digits, '-' and '_', and begin with a letter or digit"
+        )
+    return text
+
+
 def dotted(location: Location) -> str:
     """Return ``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
     parts = (f"[{key}]" if isinstance(key, int) else f".{visible(key, SHOWN_KEY)}" for key in location)

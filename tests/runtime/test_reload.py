@@ -36,7 +36,7 @@ def change(folder: Path, before: str, after: str) -> Reload:
     return reloaded(running, load_machine(folder / "machine.toml", with_driver=False))
 
 
-def test_limits_and_recording_change(tmp_path: Path) -> None:
+def test_limits_recording_and_outlets_change(tmp_path: Path) -> None:
     result = change(tmp_path, '"+40 %"', '"+60 %"')
     assert (result.limits, result.recording, result.needs_restart) == (True, False, ())
     assert any(limit.value == pytest.approx(6.5 * 1.6) for limit in result.machine.plan.parameters["R_a"].limits)
@@ -48,6 +48,9 @@ def test_limits_and_recording_change(tmp_path: Path) -> None:
     assert (result.limits, result.recording, result.needs_restart) == (False, True, ())
     assert result.machine.file.recording.enabled
     assert result.text.endswith("reloaded, recording changed")
+    result = change(tmp_path, "[recording]", '[outlets.prometheus]\nlisten = "127.0.0.1:9000"\n[recording]')
+    assert (result.outlets, result.needs_restart) == (True, ())
+    assert result.machine.file.outlets.names == ("prometheus",)
 
 
 def test_readers_and_certificates_change_but_not_endpoints(tmp_path: Path) -> None:

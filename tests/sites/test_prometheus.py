@@ -21,7 +21,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import CostDocument, DriverDocument
 from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
 from otolith.site.metrics import Metrics
-from otolith.site.outlets.runner import OutletStatus
+from otolith.site.outlets.base import OutletStatus
 from otolith.site.outlets.table import OUTLETS
 from otolith.site.settings import SiteFile
 from tests.conftest import free_port

@@ -11,6 +11,7 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import queue
+import resource
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from typing import Any
 
 from otolith.health.schema import EventDocument
@@ -196,6 +198,14 @@ class ChildProcess:
         """Processor time that the process has taken, s; 0 if it does not run."""
         pid = None if self._process is None else self._process.pid
         return 0.0 if pid is None else processor_time(pid)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of memory that the process has, with what it shares; 0 if it does not run."""
+        pid = None if self._process is None else self._process.pid
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
+        return 0
 
     @property
     def waitables(self) -> list[Any]:

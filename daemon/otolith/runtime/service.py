@@ -37,6 +37,7 @@ from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import StartDocument
 from otolith.runtime.clock import ClockReading, ServiceClock, read_clocks
 from otolith.runtime.hall.machine import FinishedWindow, Machine, Task
+from otolith.runtime.hall.outlet_process import OutletProcess
 from otolith.runtime.hall.pool import Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.process import EventCommand
@@ -53,12 +54,18 @@ from otolith_drivers.sources import open_patiently
 log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
+RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH, OUTLET_FLUSH = (
+    1.5,
+    0.5,
+    0.5,
+    1.5,
+)  # s to finish writing, or running, at the end
 LEAVE_FLUSH = 30.0  # s to write what is left of a machine that is served no longer
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 OUTAGE_AFTER = 120.0  # s for which an output fails until it is an event: a network or a clock comes later than a boot
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 Key = tuple[str, ...]
+_TAKEN_OVER = ("recording", "outlets")  # tables that a running daemon takes over
 _WORDING: set[Key] = {("machine", "language"), ("machine", "timezone")}  # what texts of limits and rules depend on
 
 
@@ -70,12 +77,15 @@ class Reload:
     limits: bool  # Or rules of the diagnosis
     recording: bool
     access: bool  # Certificates, passwords and readers
+    outlets: bool
     needs_restart: tuple[str, ...]  # Keys of the file that were changed and that a running daemon does not take over
 
     @property
     def text(self) -> str:
         """What has changed, in words."""
-        names = {"limits or rules": self.limits, "recording": self.recording, "access": self.access}
+        names = {
+            "limits or rules": self.limits, "recording": self.recording, "access": self.access, "outlets": self.outlets,
+        }  # fmt: skip
         changed = " and ".join(name for name, is_changed in names.items() if is_changed) or "nothing"
         line = f"{self.machine.path}: reloaded, {changed} changed"
         return f"{line}; only a restart takes over {', '.join(self.needs_restart)}" if self.needs_restart else line
@@ -89,22 +99,24 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     """
     old, file = running.file, new.file
     changed = list(_differences(old.model_dump(), file.model_dump()))
-    recording = any(key[0] == "recording" for key in changed)
+    recording, outlets = (any(key[0] == name for key in changed) for name in ("recording", "outlets"))
     access = any(_is_access(key) for key in changed)
     limits = [key for key in changed if _is_limit(key)]
-    rest = [key for key in changed if key[0] != "recording" and not (_is_limit(key) or _is_access(key))]
+    rest = [key for key in changed if key[0] not in _TAKEN_OVER and not (_is_limit(key) or _is_access(key))]
     if new.twin != running.twin and not any(key[0] == "twin" for key in rest):
         rest.append(("twin", "file"))
     own = file.zenoh.access.model_copy(update={"networks": old.zenoh.access.networks})
     tables = {"tls": file.zenoh.tls, "access": own}
-    update: dict[str, Any] = {"recording": file.recording, "zenoh": old.zenoh.model_copy(update=tables)}
+    update: dict[str, Any] = {name: getattr(file, name) for name in _TAKEN_OVER} | {
+        "zenoh": old.zenoh.model_copy(update=tables)
+    }
     if any(key[0] in {"twin", "parameters"} or key in _WORDING for key in rest):
         rest, limits = [*rest, *limits], []
     if limits:
         update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
     plan = new.plan if limits else running.plan
     machine = replace(running, file=old.model_copy(update=update), plan=plan, of_service=new.of_service)
-    return Reload(machine, bool(limits), recording, access, tuple(".".join(key) for key in rest))
+    return Reload(machine, bool(limits), recording, access, outlets, tuple(".".join(key) for key in rest))
 
 
 def _is_limit(key: Key) -> bool:
@@ -140,6 +152,7 @@ class SharedParts:
     """What the machines of a hall have in common."""
 
     recorder: RecorderProcess
+    outlets: OutletProcess
     storage: StorageThread
 
 
@@ -178,6 +191,7 @@ class Service:
         self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
         self._described: MonitoringPlan | None = None  # by the history
         self._recorder = RecorderSupervisor(machine, recording, None if shared is None else shared.recorder)
+        self._outlets = OutletProcess() if shared is None else shared.outlets
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self.publisher: Publisher | None = None
         self._started_at = 0.0
@@ -271,6 +285,7 @@ class Service:
         steps.callback(self._evidence.stop, WRITER_FLUSH)
         if self._shared is None:
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
+            steps.callback(self._outlets.stop, OUTLET_FLUSH)
 
     def end(self) -> None:
         """End a machine of a hall, in another thread than the main one; then another daemon may serve it."""
@@ -288,6 +303,14 @@ class Service:
         deadline = time.monotonic() + LEAVE_FLUSH
         if not all(writer.wait(max(0.0, deadline - time.monotonic())) for writer in writers):
             log.warning("writing took over %g s: check the disk", LEAVE_FLUSH)
+
+    def pass_on(self) -> None:
+        """Let other systems know of it from now on."""
+        self._outlets.serve(self._loaded)
+
+    def leave_outlets(self, *, is_gone: bool) -> None:
+        """Let other systems know that it is served no longer; ``is_gone`` if its file was changed or removed."""
+        self._outlets.leave("/".join(self.names), is_gone=is_gone)
 
     def close_driver(self) -> None:
         """Listen no longer."""
@@ -388,6 +411,7 @@ class Service:
             self.machine.revise(lambda state: self._decided(replace(state, plan=change.machine.plan), decisions))
         if change.recording:
             self._recorder.reload(self._loaded, time.monotonic())
+        self._outlets.serve(self._loaded)  # also as it was: its files, or what it lacked, may have changed
 
     def show_preparation(self, shown: Preparation, *, is_done: bool) -> None:
         """Tell readers how many kernels the workers have: until they are ready there is no report."""
@@ -418,8 +442,9 @@ class Service:
         self._save(time.monotonic())
         return line
 
-    def poll_recorder(self, now: float) -> None:
-        """Read what the recorder answers, and start it again if it must be."""
+    def poll_processes(self, now: float) -> None:
+        """Read what recorder and outlets answer, and start them again if they must be."""
+        self._outlets.poll(now)
         if self._recorder.is_enabled:
             self._recorder.poll(now)
 
@@ -431,6 +456,7 @@ class Service:
             "evidence": self._evidence.outage,
             "recording": self._recorder.outage,
             "on_event": self._command.outage,
+            "outlets": self._outlets.outage("/".join(self.names)),
             **({} if self.publisher is None else self.publisher.outages(datetime.now(UTC))),
         }
         self._failing = {name: self._failing.get(name, now) for name, reason in reasons.items() if reason}
@@ -465,6 +491,7 @@ class Service:
         document = self._clock.labels.of_report(document)
         if self.publisher is not None:
             self.publisher.publish(document)
+        self._outlets.offer(document)
         if self._recorder.is_enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
         return self._log(document, time.monotonic())

@@ -22,7 +22,7 @@ from otolith.site.compare import peers, poor_data, week
 from otolith.site.daemons import certificates, own_certificate, versions
 from otolith.site.hall import PAGES, Filter, Hall, Shown
 from otolith.site.metrics import CONTENT_TYPE, Metrics
-from otolith.site.outlets.runner import OutletStatus
+from otolith.site.outlets.base import OutletStatus
 from otolith.site.past import FIRST_SPAN, SPANS
 from otolith.site.serving.live import MAX_LIVE, Live
 from otolith.site.serving.pace import Fresh, Turns

@@ -14,8 +14,8 @@ from enum import StrEnum
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, ParameterDocument, ReportDocument
-from otolith.machine_file import check_name
 from otolith.publishing.zenoh_session import ALIVE, EVENT, REPORT
+from otolith_drivers.config_files import check_name
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MAX_MACHINES = 400
@@ -214,6 +214,11 @@ class Knowledge:
         if known is None:
             known = self._machines[f"{site}/{name}"] = KnownMachine(site, name, heard=now)
         return known
+
+    def remove(self, key: str) -> None:
+        """Know a machine, by its site and name, no longer."""
+        if (machine := self._machines.pop(key, None)) is not None:
+            self._bytes -= machine.size
 
     def _changed(self, machine: KnownMachine) -> None:
         self._revision += 1

@@ -9,8 +9,8 @@ from itertools import islice
 
 from otolith.health.limits import LEVELS, Level
 from otolith.health.schema import CountersDocument
-from otolith.site.known import MAX_MACHINES, MAX_PARAMETERS, Knowledge, KnownMachine, RefusedFor
-from otolith.site.outlets.runner import OutletStatus
+from otolith.site.known import MAX_MACHINES, MAX_PARAMETERS, KnownMachine, RefusedFor
+from otolith.site.outlets.base import Machines, OutletStatus
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 GAUGES = {
@@ -42,7 +42,7 @@ Lines = dict[str, str]
 class Metrics:
     """Writes metrics; the caller holds the lock of the knowledge."""
 
-    def __init__(self, knowledge: Knowledge) -> None:
+    def __init__(self, knowledge: Machines) -> None:
         self._knowledge = knowledge
         self._written: dict[tuple[str, str], tuple[object, Lines]] = {}  # With what they depend on
 

@@ -80,12 +80,13 @@ class Server(uvicorn.Server):
     """Ends by a signal without raising it again, so that everything is closed; cuts who hinders others."""
 
     ended_by = 0
+    takes_signals = True  # Only in the main thread
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Take the signals that end it, for as long as it serves."""
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM) if self.takes_signals else ():
             loop.add_signal_handler(number, self._end, number)
         yield
 

@@ -1,18 +1,17 @@
 """The file of a site: where its daemons are, where browsers reach it, and by which names."""
 
-import ipaddress
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from otolith.health.schema import Language
-from otolith.machine_file import Endpoint, check_name
+from otolith.machine_file import Endpoint
+from otolith.outlet_tables import HttpTable, OutletsTable
 from otolith.publishing.zenoh_config import Connection, Credentials
 from otolith.site.known import MAX_MACHINES
-from otolith.site.outlets.options import Address, OutletsTable
 from otolith_drivers.common.time_zones import check_time_zone
-from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
+from otolith_drivers.config_files import SourceFile, StrictModel, check_name, parse, read, validate
 
 OWN_HOSTS = ("localhost", "127.0.0.1", "::1")
 
@@ -26,26 +25,6 @@ def _identity(text: str) -> str:
     except ValueError as error:
         raise ValueError(f'{error}; write site and name like "hall-1/press-3"') from None
     return text
-
-
-class HttpTable(StrictModel):
-    """Where browsers reach the site."""
-
-    listen: Address = "127.0.0.1:8420"
-    hosts: tuple[str, ...] = ()  # Names by which browsers reach it, beside those of this computer for itself
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port to listen on."""
-        host, _, port = self.listen.rpartition(":")
-        return host.strip("[]"), int(port)
-
-    @model_validator(mode="after")
-    def _has_names_where_others_reach_it(self) -> "HttpTable":
-        if not ipaddress.ip_address(self.address[0]).is_loopback and not self.hosts:
-            names = 'write hosts = ["site.plant.local"], the names by which browsers reach it'
-            raise ValueError(f"listen = {self.listen!r} is for other computers: {names}")
-        return self
 
 
 class ReadersTable(StrictModel):

@@ -7,6 +7,7 @@ import json
 import socket
 import socketserver
 import threading
+import urllib.request
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 from asyncua.sync import Client
 from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
+from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import free_port
 from tests.drivers.mqtt_broker import mqtt_broker
@@ -23,6 +25,12 @@ from tests.waiting import wait_for
 
 class Rig(ABC):
     """A receiver. Not each outlet has states and events: ``None`` is what it does not have."""
+
+    name = ""
+    tells = True  # Events
+
+    def __init_subclass__(cls, name: str) -> None:
+        cls.name = name
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.port = folder, free_port(socket.SOCK_STREAM)
@@ -64,7 +72,7 @@ class _Posted(http.server.BaseHTTPRequestHandler):
         """Keep quiet."""
 
 
-class WebhookRig(Rig):
+class WebhookRig(Rig, name="webhook"):
     """A server of HTTP."""
 
     received: list[tuple[dict[str, str], bytes]]
@@ -97,7 +105,7 @@ class _Mailbox(socketserver.StreamRequestHandler):
             self.wfile.write(b"221 bye\r\n" if line.startswith(b"QUIT") else b"250 test\r\n")
 
 
-class MailRig(Rig):
+class MailRig(Rig, name="mail"):
     """A server of SMTP."""
 
     received: list[bytes]
@@ -131,7 +139,7 @@ class MailRig(Rig):
         return found
 
 
-class MqttRig(Rig):
+class MqttRig(Rig, name="mqtt"):
     """A broker, and a subscriber that comes before all, and one that comes now."""
 
     def __init__(self, folder: Path) -> None:
@@ -178,7 +186,7 @@ class MqttRig(Rig):
         return [(row["machine"], row["told"]) for row in own]
 
 
-class OpcuaRig(Rig):
+class OpcuaRig(Rig, name="opcua"):
     """A client that reads: events come to those who have subscribed them, which has a test of its own."""
 
     _held: socket.socket | None = None
@@ -219,4 +227,37 @@ def _serve(server: socketserver.TCPServer, stack: ExitStack) -> None:
     stack.callback(server.shutdown)
 
 
-RIGS: dict[str, type[Rig]] = {"mqtt": MqttRig, "webhook": WebhookRig, "mail": MailRig, "opcua": OpcuaRig}
+class PrometheusRig(Rig, name="prometheus"):
+    """Who scrapes."""
+
+    tells = False
+    _held: socket.socket | None = None
+
+    def table(self) -> str:
+        return f'listen = "127.0.0.1:{self.port}"'
+
+    def prevent(self) -> None:
+        self._held = socket.create_server(("127.0.0.1", self.port))
+
+    def start(self) -> None:
+        if self._held is not None:
+            self._held.close()
+
+    def states(self) -> dict[str, str]:
+        with suppress(OSError):  # it may not listen yet
+            return {sample.labels["machine"]: sample.labels["state"].upper().replace("_", " ")
+                    for family in text_string_to_metric_families(scraped(self.port)) for sample in family.samples
+                    if sample.name == "otolith_machine_state" and sample.value}  # fmt: skip
+        return {}
+
+    def events(self) -> None:
+        return None
+
+
+def scraped(port: int) -> str:
+    """What a scrape answers."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10.0) as answer:
+        return str(answer.read().decode())
+
+
+RIGS: dict[str, type[Rig]] = {kind.name: kind for kind in (MqttRig, WebhookRig, MailRig, OpcuaRig, PrometheusRig)}

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from otolith.health.limits import Level
 from otolith.health.text import event_in
+from otolith.outlet_tables import MailOutlet, WebhookOutlet
 from otolith.runtime.hall.files import Refused
 from otolith.runtime.hall.left_out import left_out_report
 from otolith.site.known import Knowledge
@@ -25,7 +26,6 @@ from otolith.site.outlets import mail
 from otolith.site.outlets import notices as notices_module
 from otolith.site.outlets.base import Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.notices import HOUR, LASTING, MISSED, Notices, RateLimit, Silences
-from otolith.site.outlets.options import MailOutlet, WebhookOutlet
 from otolith.site.outlets.webhook import build as webhook
 from tests.hostile import hostile_text
 from tests.messages import assert_says

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from otolith.health.limits import Level
+from otolith.outlet_tables import MqttOutlet
 from otolith.site.outlets.base import MachineView, OutletSetup
 from otolith.site.outlets.mqtt import MqttPublisher, build
-from otolith.site.outlets.options import MqttOutlet
 from tests.hostile import HOSTILE
 from tests.sites.machines import report_of
 from tests.sites.outlets.rigs import MqttRig

@@ -16,10 +16,10 @@ from asyncua.sync import Client
 
 from otolith.health.limits import Level
 from otolith.health.schema import Status
+from otolith.outlet_tables import OpcuaOutlet
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.opcua import OWN_NAMES, OpcuaServer, build
-from otolith.site.outlets.options import OpcuaOutlet
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
 from tests.hostile import HOSTILE

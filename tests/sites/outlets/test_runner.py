@@ -11,6 +11,7 @@ import pytest
 
 from otolith.health.limits import Level
 from otolith.health.schema import HealthDocument, Language
+from otolith.outlet_tables import MailOutlet
 from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.metrics import Metrics
@@ -18,7 +19,6 @@ from otolith.site.outlets import runner
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.mail import Mail
 from otolith.site.outlets.notices import LASTING, Silences
-from otolith.site.outlets.options import MailOutlet
 from otolith.site.outlets.runner import OutletRunner
 from otolith.site.words import words_in
 from tests.sites.machines import raised, report_of, sent

@@ -14,12 +14,14 @@ from otolith.fmu.description import read_fmu
 from otolith.fmu.reference import FmuReference
 from otolith.fmu_twin import TUNABLE
 from otolith.machine import LoadedMachine, load_machine
+from otolith.outlet_tables import MachineOutlets
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.identifiability import structural_identifiability
 from otolith_drivers.base import Link, Sample
+from otolith_drivers.config_files import read
 from otolith_drivers.errors import some_names
 from otolith_drivers.user_dirs import check_writable
 
@@ -48,6 +50,8 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     machine.try_fmu()
     for line in describe(machine):
         echo(line)
+    for name, place in _outlets(machine).items():
+        echo(f"outlet {name}: {place}")
     if machine.file.recording.enabled:
         check_writable(machine.recording_folder)
     if not with_device:
@@ -177,6 +181,21 @@ def of_fmu(machine: LoadedMachine) -> list[str]:
             position, speed = twin.states[rate].name, twin.states[state].name
             lines.append(f'  ! {position} integrates {speed}: write derivative = "{speed}" there in [twin.variables]')
     return lines
+
+
+def _outlets(machine: LoadedMachine) -> dict[str, str]:
+    """Return where reports are passed on to, by the name of the outlet.
+
+    Raises:
+        ConfigurationError: a file that an outlet names cannot be used.
+        ServiceError: a library is missing.
+    """
+    identity, table = machine.file.machine, machine.file.outlets
+    if not table.names:
+        return {}
+    from otolith.site.outlets.process import places
+
+    return places(MachineOutlets(identity.site, identity.name, machine.path, table), read(machine.path))
 
 
 def lines_without_limits(machine: LoadedMachine) -> list[str]:

@@ -13,7 +13,7 @@ FOLDER = click.argument("folder", metavar="DIR", type=click.Path(path_type=Path,
 
 
 def _name(_: click.Context, __: click.Parameter, name: str) -> str:
-    from otolith.machine_file import check_name
+    from otolith_drivers.config_files import check_name
 
     try:
         return check_name(name)

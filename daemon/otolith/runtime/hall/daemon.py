@@ -36,10 +36,11 @@ from otolith.runtime.hall.files import MachineFiles, Refused, one_line
 from otolith.runtime.hall.left_out import LeftOut
 from otolith.runtime.hall.machine import MAX_WAIT, Machine
 from otolith.runtime.hall.notifier import Notifier
+from otolith.runtime.hall.outlet_process import OutletProcess
 from otolith.runtime.hall.pool import Pool, Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.process import SIGNALS
-from otolith.runtime.service import Service, SharedParts
+from otolith.runtime.service import OUTLET_FLUSH, Service, SharedParts
 from otolith.storage.disk import StorageThread
 from otolith.storage.state_store import LockedError
 from otolith_drivers.errors import OtolithError, ServiceError, counted
@@ -109,6 +110,8 @@ class Daemon:
                 text = service.open(self._publisher_for(service), patiently=not self._is_alone)
         if not self._services:
             raise ServiceError("no machine can be served: the lines above say why")
+        for service in self._served:
+            service.pass_on()
         self._due = [(0.0, next(self._numbers), machine) for machine in self._services]
         self._pool.start(time.monotonic())
         if self._hall is not None:
@@ -133,7 +136,7 @@ class Daemon:
             _log_left_out(service, error)
             self._withdraw(service, error)
 
-    def _withdraw(self, service: Service, error: Exception | None = None) -> None:
+    def _withdraw(self, service: Service, error: Exception | None = None, *, is_gone: bool = False) -> None:
         """Serve a machine no longer: another daemon may, once another thread has closed what it uses.
 
         Unless another one does already, it is published then that it is not served because of an ``error``.
@@ -142,6 +145,7 @@ class Daemon:
         self._due = [row for row in self._due if row[2] is not service.machine]
         heapq.heapify(self._due)
         self._pool.leave_out(service.machine)
+        service.leave_outlets(is_gone=is_gone)
         self._background.do(partial(self._close, service, error))
 
     def _close(self, service: Service, error: Exception | None) -> Then | None:
@@ -180,6 +184,7 @@ class Daemon:
                 service.stop_outputs(steps)
             if shared is not None:
                 steps.callback(shared.recorder.stop, flush)
+                steps.callback(shared.outlets.stop, OUTLET_FLUSH)
             steps.callback(self._pool.kill)
             for service in services:
                 steps.callback(service.close_driver)
@@ -220,7 +225,7 @@ class Daemon:
                 with about(service.title):
                     log.info("its file was changed or removed: what it uses is closed")
                 service.save_last()
-                self._withdraw(service)
+                self._withdraw(service, is_gone=service.names not in new)
         for machine in changes.new:
             self._background.do(partial(self._open, machine))
         self._background.do(lambda: self._end_reload)
@@ -246,6 +251,7 @@ class Daemon:
         """Ask a machine that was opened for its windows."""
         now, most = time.monotonic(), 1 if self._hall is None else self._hall.workers
         self._services[service.machine] = service
+        service.pass_on()
         heapq.heappush(self._due, (now, next(self._numbers), service.machine))
         self._pool.add(service.machine, now, most)
 
@@ -295,7 +301,7 @@ class Daemon:
             self._recorders_at = now
             for service in self._served:
                 with self._guarded(service):
-                    service.poll_recorder(now)
+                    service.poll_processes(now)
                 if service.locked_out is not None:
                     with self._alone_or_left_out(service):
                         raise service.locked_out
@@ -389,7 +395,7 @@ def hall_of(paths: Sequence[Path], files: MachineFiles, listen: tuple[str, ...] 
     Raises:
         ServiceError: no machine can be served.
     """
-    parts = SharedParts(RecorderProcess(), StorageThread())
+    parts = SharedParts(RecorderProcess(), OutletProcess(), StorageThread())
     hall = HallSetup(tuple(paths), listen, (os.cpu_count() or 1) if workers is None else workers, parts, files.refused)
     services = [hall.service_of(machine) for machine in files.machines.values()]
     usable = [service for service in services if isinstance(service, Service)]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from otolith.health.schema import LANGUAGES, Language
 from otolith.machine import LoadedMachine, load_machine
-from otolith.machine_file import MachineTable, check_name
+from otolith.machine_file import MachineTable
 from otolith.service_file import SERVICE_FILE
 from otolith.storage.state_store import is_served
-from otolith_drivers.config_files import is_of_another_kind
+from otolith_drivers.config_files import check_name, is_of_another_kind
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)

@@ -1,14 +1,17 @@
 """What outlets share: the view of a machine, notices of its events, and what an outlet does with both."""
 
+import threading
+import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Protocol
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, Language, ReportDocument
+from otolith.site.known import KnownMachine, RefusedFor
 
 SCHEMA = "otolith.notice/1"
 
@@ -94,6 +97,47 @@ class Outlet(Protocol):
         """End it."""
 
 
+@dataclass(slots=True)
+class OutletStatus:
+    """How an outlet does, for metrics and for the log."""
+
+    name: str
+    is_up: bool = False  # Whether the last try succeeded
+    is_tried: bool = False
+    reason: str = "not tried yet"
+    failures: int = 0
+    sent: int = 0  # Notices
+    lost: int = 0  # Notices that were dropped, because of the limit per hour, after a long failure, or refused for good
+    since: float = field(default_factory=time.time)
+
+
+class Machines(Protocol):
+    """Machines of which reports were taken, and how many were not."""
+
+    @property
+    def refused(self) -> Mapping[RefusedFor, int]:
+        """Documents that were refused, by why."""
+
+    def __iter__(self) -> Iterator[KnownMachine]:
+        """Iterate over machines."""
+
+
+class Known(Protocol):
+    """What is known of machines, which is read while ``lock`` is held."""
+
+    @property
+    def lock(self) -> threading.Lock:
+        """The lock."""
+
+    @property
+    def knowledge(self) -> Machines:
+        """The machines."""
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Documents that came faster than they could be read, by where."""
+
+
 @dataclass(frozen=True, slots=True)
 class OutletSetup:
     """What an outlet is built with, besides its options."""
@@ -102,6 +146,9 @@ class OutletSetup:
     title: str
     language: Language | None = None  # By default that of each machine, and English for texts about the site
     zone: str | None = None  # By default that of each machine
+    sender: str = ""  # Who tells it: a machine and its site of a daemon; empty for a site
+    known: Known | None = None  # For an outlet that others read
+    statuses: Sequence[OutletStatus] = ()  # Of all outlets
 
 
 Build = Callable[[Any, OutletSetup], Outlet]

@@ -9,9 +9,9 @@ from email.utils import formatdate, make_msgid
 
 from otolith.health.text import texts_in
 from otolith.health.times import in_local_time, moment_text
+from otolith.outlet_tables import MailOutlet
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.connections import failure, tls_context
-from otolith.site.outlets.options import MailOutlet
 from otolith.site.words import words_in
 from otolith_drivers.common.credentials import password
 from otolith_drivers.outside_text import visible

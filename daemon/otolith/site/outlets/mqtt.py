@@ -17,11 +17,11 @@ from otolith import __version__
 from otolith.health.limits import Level
 from otolith.health.schema import Language, ParameterDocument
 from otolith.health.text import texts_in
+from otolith.outlet_tables import MqttOutlet
 from otolith.site.hall import SHOWN
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
 from otolith.site.outlets.connections import failure, tls_context
-from otolith.site.outlets.options import MqttOutlet
 from otolith.site.words import words_in
 from otolith_drivers.common.credentials import password
 from otolith_drivers.grammars.json_lines import json_text
@@ -39,16 +39,16 @@ IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template 
 class MqttPublisher:
     """Implements :class:`otolith.site.outlets.base.Outlet`. Each connection begins with all that is known."""
 
-    def __init__(self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None, language: Language) -> None:
+    def __init__(
+        self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None, language: Language, sender: str
+    ) -> None:
         self._options, self._secret, self._tls, self._language = options, secret, tls, language
+        self._sender = sender  # A machine of a daemon, or empty for a site
+        self._availability = "/".join(filter(None, (options.prefix, sender, "status")))
         self._client: mqtt.Client | None = None
         self._shown: dict[str, tuple[str, str]] = {}  # Site and name of each machine of this connection
         self._configured: set[str] = set()  # Machines of which this connection has published configurations
         self._discovered: dict[str, frozenset[tuple[str, str]]] = {}  # Parameters and units of a machine
-
-    @property
-    def _availability(self) -> str:
-        return f"{self._options.prefix}/status"
 
     def send(self, views: Sequence[MachineView], gone: Sequence[str], notices: deque[Notice]) -> bool:
         """Publish what has changed; see :class:`otolith.site.outlets.base.Outlet`."""
@@ -144,10 +144,12 @@ class MqttPublisher:
         """Yield what is published of a machine when the site ends: who comes later would read its last state."""
         state, _, availability = self._topics(key)
         yield availability, OFFLINE
-        texts = texts_in(self._language)
+        texts, words = texts_in(self._language), words_in(self._language)
+        what, advice = words["site_away"], words["site_away_advice"]
+        if self._sender:
+            what, advice = words["daemon_away"], texts("check_daemon")
         yield state, {"site": own[0], "machine": own[1], "state": str(Level.NO_DATA), "since": None,
-                      "word": texts.translated(Level.NO_DATA), "what": words_in(self._language)["site_away"],
-                      "advice": words_in(self._language)["site_away_advice"]}  # fmt: skip
+                      "word": texts.translated(Level.NO_DATA), "what": what, "advice": advice}  # fmt: skip
 
     def _discovery(self, view: MachineView) -> Iterator[tuple[str, Any]]:
         """Yield the configurations of its sensors, as Home Assistant documents them, if they are new."""
@@ -227,4 +229,4 @@ def build(options: MqttOutlet, setup: OutletSetup) -> MqttPublisher:
     secret = password(None if options.password_file is None else setup.folder / options.password_file)
     pair = (options.certificate, options.key)
     tls = tls_context(setup.folder, options.ca, pair) if options.tls else None
-    return MqttPublisher(options, secret, tls, setup.language or "en")
+    return MqttPublisher(options, secret, tls, setup.language or "en", setup.sender)

@@ -21,10 +21,10 @@ from asyncua.crypto.permission_rules import User, UserRole
 from otolith.health.limits import Level
 from otolith.health.schema import ParameterDocument, ReportDocument, Status
 from otolith.health.text import texts_in
+from otolith.outlet_tables import OpcuaOutlet
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup, Told
 from otolith.site.outlets.connections import failure
-from otolith.site.outlets.options import OpcuaOutlet
 from otolith_drivers.common.credentials import certificate_and_key, password
 from otolith_drivers.outside_text import visible
 

@@ -4,14 +4,13 @@ import logging
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from otolith.health.limits import Level
 from otolith.health.text import event_in, report_in
 from otolith.site.cards import card_of
-from otolith.site.collector import Collector
 from otolith.site.known import KnownMachine
-from otolith.site.outlets.base import MachineView, Notice, Outlet, OutletError, OutletSetup
+from otolith.site.outlets.base import Known, MachineView, Notice, Outlet, OutletError, OutletSetup, OutletStatus
 from otolith.site.outlets.notices import Notices, RateLimit, Silences
 
 log = logging.getLogger(__name__)
@@ -23,29 +22,15 @@ MAX_PENDING = 500  # notices that wait for an outlet that fails; the oldest are 
 CLOSING = 5.0  # s that an outlet may take to end
 
 
-@dataclass(slots=True)
-class OutletStatus:
-    """How an outlet does, for metrics and for the log."""
-
-    name: str
-    is_up: bool = False  # Whether the last try succeeded
-    is_tried: bool = False
-    reason: str = "not tried yet"
-    failures: int = 0
-    sent: int = 0  # Notices
-    lost: int = 0  # Notices that were dropped, because of the limit per hour, after a long failure, or refused for good
-    since: float = field(default_factory=time.time)
-
-
 class OutletRunner:
     """The thread of an outlet."""
 
-    def __init__(self, name: str, outlet: Outlet, collector: Collector, setup: OutletSetup, per_hour: int) -> None:
-        """``per_hour`` bounds its notices; their texts are in language and zone of ``setup``."""
+    def __init__(self, name: str, outlet: Outlet, known: Known, setup: OutletSetup, per_hour: int) -> None:
+        """``per_hour`` bounds its notices, 0 for none; their texts are in language and zone of ``setup``."""
         self.status = OutletStatus(name)
-        self._outlet, self._collector, self._setup = outlet, collector, setup
+        self._outlet, self._known, self._setup = outlet, known, setup
         self._notices, self._silences = Notices(time.monotonic()), Silences()
-        self._limit = RateLimit(per_hour)
+        self._limit, self._tells = RateLimit(per_hour), per_hour > 0
         self._pending: deque[Notice] = deque()
         self._dropped = 0
         self._shown: dict[str, tuple[object, ...]] = {}  # Revision of each machine that was passed on
@@ -56,9 +41,13 @@ class OutletRunner:
         """Begin."""
         self._thread.start()
 
+    def end(self) -> None:
+        """Begin to end it."""
+        self._stopping.set()
+
     def stop(self) -> None:
         """End it, within :data:`CLOSING`."""
-        self._stopping.set()
+        self.end()
         self._thread.join(CLOSING)
 
     def _run(self) -> None:
@@ -91,10 +80,13 @@ class OutletRunner:
     def _pass_on(self) -> bool:
         """Pass on what has changed; return whether the other side was reached."""
         now, language = time.monotonic(), self._setup.language
-        with self._collector.lock:
-            machines = list(self._collector.knowledge)
-            new = [*self._notices.take(machines, now), *self._silences.take(machines, now, time.time(), language)]
-            new = [self._reworded(notice) for notice in new]
+        with self._known.lock:
+            machines = list(self._known.knowledge)
+            new = list[Notice]()
+            if self._tells:
+                new += self._notices.take(machines, now)
+                new += self._silences.take(machines, now, time.time(), language)
+                new = [self._reworded(notice) for notice in new]
             changed = [view for machine in machines if (view := self._view(machine, now)) is not None]
         self._pending.extend(self._limit.passes(new, now))
         while len(self._pending) > MAX_PENDING:

@@ -2,13 +2,13 @@
 
 import importlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
-from otolith.site.collector import Collector
-from otolith.site.outlets.base import Build, OutletSetup
-from otolith.site.outlets.options import OutletsTable
+from otolith.outlet_tables import OutletsTable
+from otolith.site.outlets.base import Build, Known, Outlet, OutletSetup
 from otolith.site.outlets.runner import OutletRunner
 from otolith_drivers.config_files import Context, SourceFile
 from otolith_drivers.errors import ConfigurationError, ServiceError, installation_of
@@ -35,29 +35,36 @@ OUTLETS = {
     "webhook": OutletKind("otolith.site.outlets.webhook"),
     "mail": OutletKind("otolith.site.outlets.mail"),
     "opcua": OutletKind("otolith.site.outlets.opcua", "asyncua", "opcua"),
+    "prometheus": OutletKind("otolith.site.outlets.prometheus", "uvicorn", "site"),  # Of a daemon: a site has it
 }
 
 
-def runners_of(
-    table: OutletsTable, setup: OutletSetup, collector: Collector, file: SourceFile | None
-) -> list[OutletRunner]:
-    """Return what runs the outlets of a file, not started.
+def configured(table: OutletsTable) -> dict[str, Any]:
+    """Return the options of the outlets that a file has, by their names."""
+    return {name: options for name in OUTLETS if (options := getattr(table, name, None)) is not None}
+
+
+def built(name: str, options: Any, setup: OutletSetup, file: SourceFile | None) -> Outlet:
+    """Return an outlet of a file.
 
     Raises:
-        ConfigurationError: a file that one names cannot be used.
-        ServiceError: a library is missing.
+        ConfigurationError: a file that it names cannot be used.
+        ServiceError: its library is missing.
     """
-    runners = []
-    for name, kind in OUTLETS.items():
-        if (options := getattr(table, name)) is not None:
-            try:
-                outlet = kind.build()(options, setup)
-            except ConfigurationError as error:
-                if file is not None:
-                    Context(file).fail(("outlets", name, *error.key[1:]), str(error))
-                raise
-            runners.append(OutletRunner(name, outlet, collector, setup, options.per_hour))
-    return runners
+    try:
+        return OUTLETS[name].build()(options, setup)
+    except ConfigurationError as error:
+        if file is not None:
+            Context(file).fail(("outlets", name, *error.key[1:]), str(error))
+        raise
+
+
+def runners_of(table: OutletsTable, setup: OutletSetup, known: Known, file: SourceFile | None) -> list[OutletRunner]:
+    """Return what runs the outlets of a file, not started; raise as :func:`built`."""
+    return [
+        OutletRunner(name, built(name, options, setup, file), known, setup, options.per_hour)
+        for name, options in configured(table).items()
+    ]
 
 
 @contextmanager
@@ -68,5 +75,12 @@ def running(runners: list[OutletRunner]) -> Iterator[None]:
     try:
         yield
     finally:
-        for runner in runners:
-            runner.stop()
+        stop(runners)
+
+
+def stop(runners: Sequence[OutletRunner]) -> None:
+    """End outlets, all at the same time."""
+    for runner in runners:
+        runner.end()
+    for runner in runners:
+        runner.stop()

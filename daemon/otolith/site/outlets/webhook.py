@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from urllib.parse import urlsplit
 
 from otolith import __version__
+from otolith.outlet_tables import WebhookOutlet
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
 from otolith.site.outlets.connections import failure, tls_context
-from otolith.site.outlets.options import WebhookOutlet
 from otolith_drivers.common.credentials import password
 from otolith_drivers.grammars.json_lines import json_text
 

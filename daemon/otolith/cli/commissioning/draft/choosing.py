@@ -26,10 +26,10 @@ from otolith.cli.commissioning.machine_lines import write_machine_file
 from otolith.cli.commissioning.probe_view import fitted_tables, stdout_console
 from otolith.cli.terminal import echo
 from otolith.machine import find_twin, library_twins
-from otolith.machine_file import check_name
 from otolith.runtime.preview import duration_text
 from otolith.twin.definition import Definition
 from otolith.twin.unmeasured import Assumption
+from otolith_drivers.config_files import check_name
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.outside_text import CONTROL
 from otolith_drivers.units import Quantity, factor, is_unit

@@ -1,15 +1,15 @@
-"""The tables ``[outlets.*]`` of the file of a site. Files are named relative to it."""
+"""The tables ``[outlets.*]`` of the file of a site or of a machine. Files are named relative to it."""
 
 import ipaddress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, model_validator
 
-from otolith.machine_file import check_name
 from otolith_drivers.common.credentials import CredentialOptions
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.config_files import StrictModel, check_name
 
 PerHour = Annotated[int, Field(ge=1, le=3600)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -85,6 +85,11 @@ class MqttOutlet(NoticeOptions, CredentialOptions):
     prefix: Topic = "otolith"
     discovery: Topic | None = "homeassistant"
 
+    @property
+    def place(self) -> str:
+        """Where it passes on to."""
+        return f"broker {self.host}"
+
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
         if not self.tls and (self.ca or self.certificate):
@@ -101,6 +106,11 @@ class WebhookOutlet(NoticeOptions):
     secret_file: Path | None = None  # A file whose first line signs each request
     ca: Path | None = None  # By default the authorities of the computer
 
+    @property
+    def place(self) -> str:
+        """Where it passes on to; an address may have a secret in its path."""
+        return str(urlsplit(self.url).hostname)
+
 
 class MailOutlet(NoticeOptions):
     """``[outlets.mail]``: an e-mail with the notices of a moment."""
@@ -114,6 +124,11 @@ class MailOutlet(NoticeOptions):
     sender: MailAddress
     to: Annotated[tuple[MailAddress, ...], Field(min_length=1, max_length=20)]
     per_hour: PerHour = 20
+
+    @property
+    def place(self) -> str:
+        """Where it passes on to."""
+        return f"{', '.join(self.to)}, by {self.host}"
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -129,6 +144,11 @@ class OpcuaOutlet(NoticeOptions, CredentialOptions):
 
     listen: Address = "127.0.0.1:4840"
 
+    @property
+    def place(self) -> str:
+        """Where it is read."""
+        return f"opc.tcp://{self.listen}/otolith/"
+
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
         is_open = not _is_loopback(self.listen.rpartition(":")[0])
@@ -138,6 +158,38 @@ class OpcuaOutlet(NoticeOptions, CredentialOptions):
         return self
 
 
+class HttpTable(StrictModel):
+    """Where pages or metrics are read."""
+
+    listen: Address = "127.0.0.1:8420"
+    hosts: tuple[str, ...] = ()  # Names by which browsers reach it, beside those of this computer for itself
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port to listen on."""
+        host, _, port = self.listen.rpartition(":")
+        return host.strip("[]"), int(port)
+
+    @model_validator(mode="after")
+    def _has_names_where_others_reach_it(self) -> "HttpTable":
+        if not ipaddress.ip_address(self.address[0]).is_loopback and not self.hosts:
+            names = 'write hosts = ["site.plant.local"], the names by which browsers reach it'
+            raise ValueError(f"listen = {self.listen!r} is for other computers: {names}")
+        return self
+
+
+class PrometheusOutlet(HttpTable):
+    """``[outlets.prometheus]`` of a machine file: ``/metrics`` and ``/healthz``, which a site has in any case."""
+
+    listen: Address = "127.0.0.1:8421"
+    per_hour: ClassVar[int] = 0  # It tells no notices
+
+    @property
+    def place(self) -> str:
+        """Where it is read."""
+        return f"http://{self.listen}/metrics"
+
+
 class OutletsTable(StrictModel):
     """``[outlets]``: each table is one outlet. ``/metrics`` for Prometheus is always there."""
 
@@ -145,3 +197,29 @@ class OutletsTable(StrictModel):
     webhook: WebhookOutlet | None = None
     mail: MailOutlet | None = None
     opcua: OpcuaOutlet | None = None
+
+
+class MachineOutletsTable(OutletsTable):
+    """``[outlets]`` of a machine file."""
+
+    prometheus: PrometheusOutlet | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The outlets that the file has."""
+        return tuple(name for name in type(self).model_fields if getattr(self, name) is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class MachineOutlets:
+    """What a daemon passes on of a machine."""
+
+    site: str
+    machine: str
+    file: Path  # Of the machine
+    table: MachineOutletsTable
+
+    @property
+    def key(self) -> str:
+        """Site and name."""
+        return f"{self.site}/{self.machine}"

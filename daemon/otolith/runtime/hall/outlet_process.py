@@ -1,0 +1,120 @@
+"""The one process of a service that passes reports on to other systems: started with the first machine that wants it.
+
+It is restarted when it has died, hangs, or has become too large. The main thread only queues reports for it.
+"""
+
+import logging
+import time
+from collections.abc import Mapping
+
+from otolith.health.schema import ReportDocument
+from otolith.machine import LoadedMachine
+from otolith.outlet_tables import MachineOutlets
+from otolith.runtime.effort import Effort
+from otolith.runtime.process import ChildProcess
+
+log = logging.getLogger(__name__)
+
+MAIN = "otolith.site.outlets.process:main"  # Which only the process imports
+
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+OUTLET_ROOM = 32  # messages of a machine that wait for the process
+OUTLET_TIMEOUT = 60.0  # s of effort without an answer, while messages wait, after which it hangs
+OUTLET_HEALTHY_AGE = 60.0  # s after which its restart pause is reset
+OUTLET_MEMORY = 500e6  # bytes above which it is killed
+LOOK_PAUSE = 0.1  # s between two looks at it
+MEMORY_PAUSE = 5.0  # s between two looks at its memory
+MIN_DEATHS = 4  # in a row, from which it is out of order and not restarted by chance
+
+
+class OutletProcess:
+    """Times are monotonic, s."""
+
+    def __init__(self, main: str = MAIN) -> None:
+        self.child = ChildProcess("otolith-outlets", main, OUTLET_ROOM)
+        self.dropped = 0  # Reports that no outlet has received
+        self._machines: dict[str, MachineOutlets] = {}
+        self._reasons: Mapping[str, str] = {}
+        self._unanswered = 0
+        self._effort = Effort()
+        self._looked_at = self._weighed_at = 0.0
+
+    def serve(self, machine: LoadedMachine) -> None:
+        """Pass on a machine from now on, by the tables of its file, or by those that it has now."""
+        identity = machine.file.machine
+        own = MachineOutlets(identity.site, identity.name, machine.path, machine.file.outlets)
+        if not own.table.names and own.key not in self._machines:
+            return
+        self._machines[own.key] = own
+        self.child.widen(OUTLET_ROOM * len(self._machines))
+        self._send(own.key, own)
+
+    def leave(self, key: str, *, is_gone: bool) -> None:
+        """Pass on a machine no longer; ``is_gone`` if its file was removed."""
+        if self._machines.pop(key, None) is not None:
+            self._send(key, is_gone)
+
+    def offer(self, document: ReportDocument) -> None:
+        """Give it a report, without waiting."""
+        key = f"{document.site}/{document.machine}"
+        own = self._machines.get(key)
+        if own is not None and own.table.names and not self._send(key, (self.dropped, document.to_json().encode())):
+            self.dropped += 1
+
+    def outage(self, key: str) -> str:
+        """Return why reports of a machine are not passed on; empty if they are, or should not be."""
+        if key not in self._machines:
+            return ""
+        if self.child.deaths >= MIN_DEATHS:
+            return f"the process of outlets has ended {self.child.deaths} times"
+        return self._reasons.get(key, "")
+
+    def poll(self, now: float) -> None:
+        """Read answers, kill it if it hangs or is too large, and start it if it does not run."""
+        if not (self._machines or self.child.alive) or now - self._looked_at < LOOK_PAUSE:
+            return
+        self._looked_at = now
+        self._read(now)
+        if self.child.alive:
+            self._supervise(now)
+            return
+        self.dropped += self._unanswered
+        self._unanswered, self._reasons = 0, {}
+        if self._machines and self.child.may_restart(now):
+            self.child.start(tuple(self._machines.values()))
+
+    def stop(self, seconds: float) -> None:
+        """Let it tell for up to ``seconds`` that the daemon ends."""
+        self.child.stop(seconds)
+
+    def _send(self, key: str, content: object) -> bool:
+        if not (self.child.alive and self.child.offer((key, content))):
+            return False
+        if not self._unanswered:
+            self._effort.begin(time.monotonic(), self.child.processor_time)
+        self._unanswered += 1
+        return True
+
+    def _read(self, now: float) -> None:
+        for answer in self.child.replies():
+            self._unanswered = max(0, self._unanswered - 1)
+            self._effort.begin(now, self.child.processor_time)
+            reasons, lines = answer
+            if reasons is not None:
+                self._reasons = reasons
+            for name, level, text in lines:
+                logging.getLogger(name).log(level, "%s", text)
+
+    def _supervise(self, now: float) -> None:
+        if self.child.age > OUTLET_HEALTHY_AGE:
+            self.child.reset_backoff()
+        reason = ""
+        if self._unanswered and self._effort.seconds(now, self.child.processor_time) > OUTLET_TIMEOUT:
+            reason = f"has not answered in {OUTLET_TIMEOUT:g} s of processor time and waiting"
+        elif now - self._weighed_at >= MEMORY_PAUSE:
+            self._weighed_at = now
+            if (memory := self.child.memory) > OUTLET_MEMORY:
+                reason = f"has {memory / 1e6:.0f} MB of memory, over {OUTLET_MEMORY / 1e6:.0f} MB"
+        if reason:
+            log.warning("the process of outlets %s, and is killed", reason)
+            self.child.kill()

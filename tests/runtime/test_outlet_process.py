@@ -1,0 +1,137 @@
+"""The process of outlets: the daemon neither waits for it nor ends with it."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from otolith.machine import load_machine
+from otolith.runtime.hall import outlet_process
+from otolith.runtime.hall.outlet_process import OUTLET_ROOM, OutletProcess
+from tests.conftest import EXAMPLES
+from tests.sites.machines import report_of
+from tests.sites.outlets.rigs import PrometheusRig
+from tests.waiting import wait_for, within
+
+HEAVY = ("paho", "asyncua", "starlette", "uvicorn", "otolith.site", "smtplib")
+
+
+def answer_nothing(connection: Any, _: Any) -> None:
+    """What runs in a process that hangs, and is large."""
+    kept = bytearray(64 << 20)
+    connection.recv()
+    time.sleep(600.0)
+    del kept
+
+
+def machine_file(folder: Path, rig: PrometheusRig) -> Path:
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
+    file = folder / "machine.toml"
+    file.write_text(f"{text}\n[outlets.prometheus]\n{rig.table()}\n", encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> PrometheusRig:
+    return PrometheusRig(tmp_path)
+
+
+@pytest.fixture
+def process(monkeypatch: pytest.MonkeyPatch) -> Iterator[OutletProcess]:
+    monkeypatch.setattr(outlet_process, "LOOK_PAUSE", 0.0)
+    monkeypatch.setattr(outlet_process, "MEMORY_PAUSE", 0.1)
+    made = OutletProcess()
+    yield made
+    made.stop(1.0)
+
+
+def looking(process: OutletProcess, enough: Any) -> None:
+    def looked() -> bool:
+        process.poll(time.monotonic())
+        return bool(enough())
+
+    wait_for(looked)
+
+
+def test_reports_are_passed_on_also_after_the_process_was_killed(
+    process: OutletProcess, rig: PrometheusRig, tmp_path: Path
+) -> None:
+    machine = load_machine(machine_file(tmp_path, rig))
+    identity, number = machine.file.machine, 0
+    process.serve(machine)
+
+    def states() -> dict[str, str]:
+        nonlocal number
+        number += 1
+        process.offer(report_of(identity.name, number, time.time(), site=identity.site))
+        return rig.states()
+
+    looking(process, lambda: states() == {identity.name: "OK"})
+    (child,) = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+    child.kill()
+    looking(process, lambda: process.child.starts == 2)
+    looking(process, lambda: states() == {identity.name: "OK"})
+    process.leave(f"{identity.site}/{identity.name}", is_gone=True)
+    wait_for(lambda: rig.states() == {})
+
+
+def test_a_machine_without_outlets_starts_no_process(process: OutletProcess) -> None:
+    process.serve(load_machine(EXAMPLES / "dc-motor-in-process.toml"))
+    process.poll(time.monotonic())
+    process.offer(report_of())
+    assert (process.child.starts, process.dropped) == (0, 0)
+
+
+@pytest.mark.parametrize("bounds", [{"OUTLET_TIMEOUT": 1.0}, {"OUTLET_MEMORY": 60e6}])
+def test_a_process_that_hangs_or_is_too_large_is_killed_and_delays_nobody(
+    monkeypatch: pytest.MonkeyPatch, rig: PrometheusRig, tmp_path: Path, bounds: dict[str, float]
+) -> None:
+    for name, bound in (bounds | {"LOOK_PAUSE": 0.0, "MEMORY_PAUSE": 0.0}).items():
+        monkeypatch.setattr(outlet_process, name, bound)
+    process, machine = OutletProcess(f"{__name__}:answer_nothing"), load_machine(machine_file(tmp_path, rig))
+    identity, longest = machine.file.machine, 0.0
+    process.serve(machine)
+    process.poll(time.monotonic())
+    try:
+        for _ in range(3 * OUTLET_ROOM):
+            begun = time.monotonic()
+            process.offer(report_of(identity.name, site=identity.site))
+            longest = max(longest, time.monotonic() - begun)
+        assert process.dropped > 0
+        assert longest <= within(0.1)
+        looking(process, lambda: process.child.starts >= 2)
+    finally:
+        process.stop(0.1)
+
+
+def test_why_an_outlet_fails_is_known_to_the_daemon(process: OutletProcess, rig: PrometheusRig, tmp_path: Path) -> None:
+    machine = load_machine(machine_file(tmp_path, rig))
+    key = f"{machine.file.machine.site}/{machine.file.machine.name}"
+    rig.prevent()
+    process.serve(machine)
+
+    def is_told() -> bool:
+        process.offer(report_of(machine.file.machine.name, None, time.time(), site=machine.file.machine.site))
+        return f"127.0.0.1:{rig.port}" in process.outage(key)
+
+    looking(process, is_told)
+    rig.start()
+    looking(process, lambda: not (is_told() or process.outage(key)))
+
+
+def test_a_daemon_imports_no_library_of_an_outlet(tmp_path: Path, rig: PrometheusRig) -> None:
+    file = machine_file(tmp_path, rig)
+    script = (
+        "import sys\nfrom pathlib import Path\nfrom otolith.machine import load_machine\n"
+        "import otolith.runtime.hall.daemon, otolith.runtime.worker\n"
+        f"assert load_machine(Path({str(file)!r})).file.outlets.names == ('prometheus',)\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
