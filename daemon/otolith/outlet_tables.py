@@ -209,6 +209,19 @@ class MachineOutletsTable(OutletsTable):
         """The outlets that the file has."""
         return tuple(name for name in type(self).model_fields if getattr(self, name) is not None)
 
+    @property
+    def reached(self) -> tuple[str, ...]:
+        """The computers that outlets connect to."""
+        web = None if self.webhook is None else urlsplit(self.webhook.url).hostname
+        hosts = [web] if web is not None else []
+        return (*hosts, *(own.host for own in (self.mqtt, self.mail) if own is not None))
+
+    @property
+    def listening(self) -> tuple[str, ...]:
+        """The addresses of this computer at which outlets are read."""
+        own = (self.prometheus, self.opcua)
+        return tuple(each.listen.rpartition(":")[0].strip("[]") for each in own if each is not None)
+
 
 @dataclass(frozen=True, slots=True)
 class MachineOutlets:

@@ -12,6 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from otolith.machine_file import EvidenceTable, HistoryTable, MachineFile, RecordingTable, ZenohTable
+from otolith.outlet_tables import MachineOutletsTable
 from otolith_drivers.config_files import StrictModel, expect, parse, read, validate
 
 SERVICE_FILE = "service.toml"
@@ -32,6 +33,7 @@ class ServiceFile(StrictModel):
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
     evidence: EvidenceTable = EvidenceTable()
+    outlets: MachineOutletsTable = MachineOutletsTable()
 
 
 TABLES = tuple(name for name in ServiceFile.model_fields if name in MachineFile.model_fields)

@@ -6,7 +6,9 @@ import pytest
 
 from otolith.cli.commissioning.check import check_machine, describe, without_sensors
 from otolith.machine import load_machine
+from otolith_drivers.errors import ConfigurationError
 from tests.conftest import OwnMachine
+from tests.messages import assert_says
 
 
 def checked(machine: Path, *, complete: bool = True) -> dict[str, str]:
@@ -79,3 +81,36 @@ def test_what_is_lost_without_two_sensors(tmp_path: Path) -> None:
     assert "only together with u" in impossible["k_v"]
     (scale,) = (line for line in lines if "only their ratios" in line)
     assert scale.startswith("T_m: as right as the given t_1, ")
+
+
+OUTLETS = '[outlets.prometheus]\n[outlets.webhook]\nurl = "https://tickets.example/hook"\nsecret_file = "secret"\n'
+
+
+def test_outlets_are_named_with_where_they_pass_on_to(tmp_path: Path) -> None:
+    own = OwnMachine(tmp_path, "in-process").machine
+    own.write_text(f"{own.read_text(encoding='utf-8')}\n{OUTLETS}", encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        checked(own)
+    assert_says(str(caught.value), "machine.toml", "outlets.webhook.secret_file", str(tmp_path / "secret"))
+    (tmp_path / "secret").write_text("a", encoding="utf-8")
+    (tmp_path / "secret").chmod(0o600)
+    lines = checked(own)["all"]
+    assert_says(lines, "outlet prometheus", "http://127.0.0.1:8421/metrics", "outlet webhook", "tickets.example")
+
+
+@pytest.mark.parametrize(
+    ("table", "needles"),
+    [
+        ('[outlets.prometheus]\nlisten = "0.0.0.0:8421"\n', ("outlets.prometheus", "0.0.0.0:8421", "hosts")),
+        ("[outlets.prometheus]\nport = 1\n", ("outlets.prometheus.port", "listen")),
+        ('[outlets.mail]\nhost = "a"\nsender = "a@b"\nto = []\n', ("outlets.mail.to", "at least 1")),
+        ('[outlets.mqtt]\nhost = "a"\nport = 70000\n', ("outlets.mqtt.port", "70000", "65535")),
+        ('[outlets.email]\nhost = "a"\n', ("outlets.email", "mail")),
+    ],
+)
+def test_a_mistake_in_an_outlet_is_named_with_its_key(tmp_path: Path, table: str, needles: tuple[str, ...]) -> None:
+    own = OwnMachine(tmp_path, "in-process").machine
+    own.write_text(f"{own.read_text(encoding='utf-8')}\n{table}", encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        load_machine(own)
+    assert_says(str(caught.value), "machine.toml", *needles)

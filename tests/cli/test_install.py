@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -14,6 +15,7 @@ from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
 from otolith.cli.operation.install import HALL_UNIT, UNIT, _commands, _run, drop_in, named_files
 from otolith.machine import load_machine
+from otolith.outlet_tables import MachineOutletsTable
 from otolith_drivers.canbus import bus as can_bus
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.conftest import EXAMPLES
@@ -380,6 +382,25 @@ def test_the_drop_in_allows_what_the_file_names() -> None:
     assert "multicast" not in drop_in("press", [{"type": "can", "channel": "can0"}], LOOPBACK, ())
     adapter = drop_in("press", [{"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0@115200"}], LOOPBACK, ())
     assert "DeviceAllow=/dev/ttyACM0 rw" in adapter
+
+
+@pytest.mark.parametrize(
+    ("outlets", "allowed"),
+    [
+        ({"prometheus": {}}, ["localhost"]),
+        ({"mqtt": {"host": "192.168.0.9"}, "opcua": {}}, ["localhost", "192.168.0.9"]),
+        ({"webhook": {"url": "https://tickets.plant.local/a"}}, []),  # its address is not known: none is denied
+        ({"mail": {"host": "mail.plant.local", "sender": "a@b.c", "to": ["a@b.c"]}}, []),
+        ({"prometheus": {"listen": "0.0.0.0:8421", "hosts": ["press-3"]}}, []),
+    ],
+)
+def test_the_service_reaches_where_its_outlets_pass_on_to(outlets: dict[str, Any], allowed: list[str]) -> None:
+    table = MachineOutletsTable.model_validate(outlets)
+    driver = {"type": "can", "channel": "can0"}
+    lines = drop_in("press", [driver], ("local",), (), networks=(), outlets=[table]).splitlines()
+    assert "RestrictAddressFamilies=AF_UNIX AF_CAN AF_INET AF_INET6" in lines
+    assert [line.partition("=")[2] for line in lines if line.startswith("IPAddressAllow")] == allowed
+    assert ("IPAddressDeny=any" in lines) == bool(allowed)
 
 
 @pytest.mark.parametrize(

@@ -494,6 +494,7 @@ api_token = "SECRET"
 key = "SECRET"
 list = [{ pass = "SECRET", x = 1.5 }]"""
     text = text.replace("[driver]", driver, 1) + '\n[zenoh.access]\npasswords = "SECRET"\n'
+    text += '[outlets.webhook]\nurl = "https://example.org/SECRET"\n'
     text = text.replace("[machine]", '[machine]\non_event = ["/bin/x", "--token", "SECRET"]', 1)
     public = public_text(tomllib.loads(text))
     assert "SECRET" not in public

@@ -48,7 +48,7 @@ PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # that are unpacked by pa
 FMU = "fmu.txt"  # in place of the twin: which FMU has its equations
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
-PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
+PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": (), "outlets": ()}
 """Keys of tables of a machine file that bundles have; others may be secrets."""
 COMPUTED = frozenset({EventChange.RAISED, EventChange.CHANGED, EventChange.CLEARED})  # Changes that windows made
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.

@@ -26,6 +26,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError, shown, some
 if TYPE_CHECKING:
     from otolith.machine import LoadedMachine
     from otolith.machine_file import ZenohTable
+    from otolith.outlet_tables import MachineOutletsTable
 
 UNIT, HALL_UNIT, SYSUSERS = "otolith@.service", "otolith.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
@@ -143,7 +144,7 @@ def _files(target: Target, root: Path) -> Iterator[InstalledFile]:
     template = HALL_UNIT if target.is_hall else UNIT
     yield InstalledFile(etc / "systemd/system" / template, (shipped / template).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
-    zenoh = [_zenoh_there(machine, root / target.folder) for machine in machines]
+    zenoh: list[ZenohTable] = [_there(machine, root / target.folder, "zenoh") for machine in machines]
     text = drop_in(
         f"{HALL}/*" if target.is_hall else target.source.stem,
         [driver for machine in machines for driver in machine.file.drivers],
@@ -151,6 +152,7 @@ def _files(target: Target, root: Path) -> Iterator[InstalledFile]:
         list(dict.fromkeys(endpoint for table in zenoh for endpoint in table.connect)),
         command=any(machine.file.machine.on_event for machine in machines),
         networks=_networks(zenoh),
+        outlets=[_there(machine, root / target.folder, "outlets") for machine in machines],
     )
     yield InstalledFile(etc / f"systemd/system/{target.unit}.service.d/machine.conf", text.encode())
     files, folder = list(target.files), target.files[0].parent
@@ -163,13 +165,13 @@ def _files(target: Target, root: Path) -> Iterator[InstalledFile]:
         yield InstalledFile(target.folder / name, source.read_bytes(), is_private)
 
 
-def _zenoh_there(machine: "LoadedMachine", folder: Path) -> "ZenohTable":
+def _there(machine: "LoadedMachine", folder: Path, table: str) -> Any:
     """Return the table that a machine has once it is in ``folder``, where a file of the service may be already."""
     from otolith.service_file import service_file_in
 
-    is_own = "zenoh" in machine.file.model_fields_set
+    is_own = table in machine.file.model_fields_set
     there = None if is_own else service_file_in(folder)
-    return machine.file.zenoh if there is None else there.zenoh
+    return getattr(machine.file if there is None else there, table)
 
 
 def _networks(tables: "Sequence[ZenohTable]") -> list[str] | None:
@@ -238,11 +240,12 @@ def drop_in(
     *,
     command: bool = False,
     networks: Sequence[str] | None = None,
+    outlets: "Sequence[MachineOutletsTable]" = (),
 ) -> str:
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
     ``command``: the daemon runs one for each event, which may use the network of this computer. ``networks`` are those
-    of the readers, None if they are not known.
+    of the readers, None if they are not known. ``outlets`` reach other computers, or are reached by readers.
     """
     from otolith.machine_file import address_of, host_of
 
@@ -255,18 +258,21 @@ def drop_in(
     hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
     published = [host for endpoint in listen if (host := host_of(endpoint))]
+    hosts += [host for table in outlets for host in table.reached]
+    served = [host for table in outlets for host in table.listening]
     buses = [_can_bus(driver) for driver in drivers if driver.get("type") == "can"]
     foreign = [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
     foreign += [f"CAN interface {bus!r}" for bus in buses if bus not in KNOWN_BUSES]
     if not foreign:
-        needs_ip = hosts or published or command or "udp_multicast" in buses
+        needs_ip = hosts or published or served or command or "udp_multicast" in buses
         sockets = (["AF_CAN"] if "socketcan" in buses else []) + (["AF_INET", "AF_INET6"] if needs_ip else [])
         lines += ["RestrictAddressFamilies=", " ".join(["RestrictAddressFamilies=AF_UNIX", *sockets])]
         lines += [] if sockets else ["PrivateNetwork=yes"]
-    local = {host: (address := address_of(host)) and address.is_loopback for host in hosts + published}
+    local = {host: (address := address_of(host)) and address.is_loopback for host in hosts + published + served}
     local["localhost"] = True
     unknown = [host for host in hosts if local[host] is None]
     unknown += [host for host in published if networks is None and not local[host]]
+    unknown += [host for host in served if not local[host]]
     if unknown or foreign:
         names = some_names([shown(name) for name in dict.fromkeys([*unknown, *foreign])])
         lines += [comment(f"No IPAddressDeny: the addresses of these are not known: {names}")]
