@@ -45,7 +45,8 @@ class MetricsServer:
         notices.clear()
         if self._thread is not None and self._thread.is_alive():
             return True
-        raise_descriptor_limit()
+        with contextlib.suppress(OSError, ValueError):  # a service may not
+            raise_descriptor_limit()
         try:
             listening = listening_on(self._options.address)
         except OSError as error:
