@@ -229,7 +229,7 @@ class MachineOutlets:
 
     site: str
     machine: str
-    file: Path  # Of the machine
+    file: Path  # That has the table
     table: MachineOutletsTable
 
     @property

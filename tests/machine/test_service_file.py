@@ -29,6 +29,7 @@ max_gigabytes = 2
 days = 30
 [evidence]
 max_megabytes = 7
+[outlets.prometheus]
 """
 
 
@@ -55,6 +56,7 @@ def test_tables_of_the_service_hold_for_each_machine_beside_it(folder: Path) -> 
         assert machine.file.recording.max_gigabytes == 2
         assert machine.file.history.days == 30
         assert machine.file.evidence.max_megabytes == 7
+        assert machine.file.outlets.names == ("prometheus",)
     assert workers_of([folder]) == 3
     assert workers_of([folder.parent]) is None
 

@@ -190,12 +190,12 @@ def _outlets(machine: LoadedMachine) -> dict[str, str]:
         ConfigurationError: a file that an outlet names cannot be used.
         ServiceError: a library is missing.
     """
-    identity, table = machine.file.machine, machine.file.outlets
+    identity, table, file = machine.file.machine, machine.file.outlets, machine.path_of("outlets")
     if not table.names:
         return {}
     from otolith.site.outlets.process import places
 
-    return places(MachineOutlets(identity.site, identity.name, machine.path, table), read(machine.path))
+    return places(MachineOutlets(identity.site, identity.name, file, table), read(file))
 
 
 def lines_without_limits(machine: LoadedMachine) -> list[str]:

@@ -42,7 +42,7 @@ class OutletProcess:
     def serve(self, machine: LoadedMachine) -> None:
         """Pass on a machine from now on, by the tables of its file, or by those that it has now."""
         identity = machine.file.machine
-        own = MachineOutlets(identity.site, identity.name, machine.path, machine.file.outlets)
+        own = MachineOutlets(identity.site, identity.name, machine.path_of("outlets"), machine.file.outlets)
         if not own.table.names and own.key not in self._machines:
             return
         self._machines[own.key] = own
