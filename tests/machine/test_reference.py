@@ -10,6 +10,7 @@ from pydantic import BaseModel, TypeAdapter
 from otolith import machine_file
 from otolith.fmu_twin import VariableTable
 from otolith.health.diagnosis import OwnRule
+from otolith.outlet_tables import PrometheusOutlet
 from otolith_drivers.canbus import driver as can
 from otolith_drivers.canbus.options import MessageTable, PdoTable
 from otolith_drivers.modbus import driver as modbus
@@ -38,6 +39,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[zenoh]", "key of `[zenoh.access]`", machine_file.AccessTable),
     ("[recording]", "key", machine_file.RecordingTable),
     ("[history]", "key", machine_file.HistoryTable),
+    ("[outlets]", "key of `[outlets.prometheus]`", PrometheusOutlet),
     ('type = "can"', "key", can.Options),
     ('type = "can"', "key of `[[driver.pdo]]`", PdoTable),
     ('type = "can"', "key of `[driver.messages.Name]`", MessageTable),
