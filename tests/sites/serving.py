@@ -4,6 +4,8 @@ import http.client
 import socket
 import subprocess
 import sys
+import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,12 +24,44 @@ class Answer:
     text: str
 
 
+class Said:
+    """The last lines that a process wrote, read as they come: a pipe that nobody reads would block it once it is full.
+    """
+
+    def __init__(self, process: "subprocess.Popen[str]") -> None:
+        self._lines: deque[str] = deque(maxlen=1000)
+        self._first, self._process = threading.Event(), process
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        for line in self._process.stderr or ():
+            self._lines.append(line)
+            self._first.set()
+        self._first.set()
+
+    def first(self) -> str:
+        """Wait for its first line; empty if it ended without one."""
+        assert self._first.wait(PATIENCE)
+        return self._lines[0] if self._lines else ""
+
+    def all(self) -> str:
+        """Return what it has written until it ended."""
+        self._thread.join(PATIENCE)
+        return self.now()
+
+    def now(self) -> str:
+        """Return what it has written so far."""
+        return "".join(tuple(self._lines))
+
+
 @dataclass(frozen=True, slots=True)
 class Served:
     """A site that runs."""
 
     port: int
     process: "subprocess.Popen[str]" = field(repr=False)
+    said: Said = field(repr=False)
 
     @property
     def address(self) -> str:
@@ -65,13 +99,12 @@ def serving(folder: Path, *endpoints: str, more: str = "", tables: str = "") -> 
     command = [sys.executable, "-m", "otolith", "site", str(file)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            assert f"http://127.0.0.1:{port}/" in line, line
-            yield Served(port, process)
+            said = Said(process)
+            assert f"http://127.0.0.1:{port}/" in said.first(), said.now()
+            yield Served(port, process, said)
         finally:
             process.terminate()
-            process.communicate(timeout=PATIENCE)
+            process.wait(PATIENCE)
 
 
 @contextmanager
