@@ -228,10 +228,11 @@ class TlsTable(StrictModel):
 
 
 class AccessTable(StrictModel):
-    """Who may read the reports; nobody but the daemon may write under its keys."""
+    """Who may read the reports, and send commands; nobody but the daemon may write under its keys."""
 
     passwords: Path | None = None  # File of lines name:password; with it, every connection needs one of them
     readers: tuple[str, ...] | None = None  # Names of certificates and users that may read; by default all that connect
+    commands: tuple[str, ...] = ()  # Names of certificates that may send commands; by default nobody may
     networks: tuple[Annotated[str, AfterValidator(_network)], ...] | None = None  # That the service accepts
 
 

@@ -159,6 +159,10 @@ class OperatorDecisions:
     """Of the parameters; relative limits refer to those that :meth:`holding` returns."""
     notes: tuple[OperatorNote, ...] = ()  # What persons did with events
 
+    def without(self, component: str) -> "OperatorDecisions":
+        """Return the decisions without what was decided about a component."""
+        return replace(self, approved=self.approved - {component}, rejected=self.rejected - {component})
+
     def holding(self, problem: Problem, before: Mapping[str, Baseline] | None = None) -> dict[str, Baseline]:
         """Return the baselines that were found with the twin and the known values of ``problem``.
 

@@ -14,7 +14,17 @@ from otolith.discovery.alternatives import ACCEPTED, NO_EVIDENCE, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan, diagnose
 from otolith.health.limits import MACHINE, Coldness, Level, MonitoredQuantity
-from otolith.health.notes import Deed, OperatorNote, Shelf, ended_events, lasting, noted, of_event, shelved_until
+from otolith.health.notes import (
+    Deed,
+    OperatorNote,
+    Shelf,
+    commented,
+    ended_events,
+    lasting,
+    noted,
+    of_event,
+    shelved_until,
+)
 from otolith.health.observations import (
     BUS,
     COLDER,
@@ -215,7 +225,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
                 record = replace(record, event=None, cleared=report.window.index)
         if not record.is_over(report.window.index):
             records[key] = record
-    events += [_ended(plan, event, report.window.start) for event in state.dropped]
+    events += [_ended(plan, event, report.window.start, of_event(state.notes, event.id)) for event in state.dropped]
     events += ended_events(state.notes)
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
@@ -471,8 +481,10 @@ def _deciding_limit(
     return before.held if level is before.level else event.evidence.limit
 
 
-def _ended(plan: MonitoringPlan, event: EventDocument, now: float) -> EventDocument:
-    """Return a dropped event as it is cleared."""
+def _ended(plan: MonitoringPlan, event: EventDocument, now: float, notes: Iterable[OperatorNote]) -> EventDocument:
+    """Return a dropped event as it is cleared, with what persons wrote to it meanwhile."""
+    for note in notes:
+        event = commented(event, note.document) if note.deed is Deed.COMMENT else event
     reason = plan.texts.translated(event.reason or "")
     update = {"change": EventChange.CLEARED, "end": max(event.since, now), "reason": reason}
     return event.model_copy(update={**update, "sequence": None, "previous": None})

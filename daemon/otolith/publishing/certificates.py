@@ -68,12 +68,12 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     trusted = authorities(identity.ca, keys[0])
     chain = authorities(identity.certificate, at_certificate)
     own, name = chain[0], identity.certificate
-    private = _private_key(identity.key, at_key)
+    private = private_key(identity.key, at_key)
     if private.public_key() != own.public_key():
         raise ConfigurationError(f"{identity.key}: does not belong to the certificate {name}", at_key)
     if not own.subject.get_attributes_for_oid(NameOID.COMMON_NAME):
         raise ConfigurationError(f"{name}: has no common name, by which access is granted", at_certificate)
-    if len(chain) == 1 and not any(_issued(own, authority) for authority in trusted):
+    if len(chain) == 1 and not any(is_issued(own, authority) for authority in trusted):
         raise ConfigurationError(f"{name}: was not issued by {identity.ca}", at_certificate)
     names = _names(own)
     for host in hosts:
@@ -90,7 +90,8 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     return own
 
 
-def _private_key(path: Path, key: Key) -> PrivateKeyTypes:
+def private_key(path: Path, key: Key) -> PrivateKeyTypes:
+    """Return the private key in ``path``; raise ConfigurationError if it has none, or others may read it."""
     data = secret(path, key)
     try:
         return serialization.load_pem_private_key(data, password=None)
@@ -100,7 +101,8 @@ def _private_key(path: Path, key: Key) -> PrivateKeyTypes:
         raise ConfigurationError(f"{path}: not a private key in PEM form", key) from error
 
 
-def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+def is_issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Whether an authority itself has issued a certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature):
@@ -222,7 +224,7 @@ def _issue(
     if name == "ca":
         raise ConfigurationError(f"{folder / name}.crt: is the certificate of the authority: use another name")
     (authority,) = authorities(folder / "ca.crt", ())[:1]
-    signer = _private_key(folder / "ca.key", ())
+    signer = private_key(folder / "ca.key", ())
     if not isinstance(signer, ec.EllipticCurvePrivateKey) or signer.public_key() != authority.public_key():
         raise ConfigurationError(f"{folder / 'ca.key'}: is not the key of {folder / 'ca.crt'}")
     private = ec.generate_private_key(ec.SECP256R1())

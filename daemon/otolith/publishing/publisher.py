@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
+from typing import TYPE_CHECKING
 
 import zenoh
 
@@ -22,6 +23,7 @@ from otolith.health.text import announcements
 from otolith.publishing.zenoh_config import ENCRYPTED, NOTICE_DAYS, Access, Settings, Validity, listening
 from otolith.publishing.zenoh_session import (
     ALIVE,
+    COMMAND,
     EVENT,
     PARAMETER,
     REPORT,
@@ -36,9 +38,13 @@ from otolith.publishing.zenoh_session import (
     prefix,
     session,
 )
+from otolith.storage.decisions import DecisionsFile
 from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.config_files import DocumentModel
 from otolith_drivers.errors import NotValidNowError, OtolithError, ServiceError
+
+if TYPE_CHECKING:
+    from otolith.publishing.commands.desk import CommandDesk
 
 log = logging.getLogger(__name__)
 
@@ -52,11 +58,16 @@ UNAVAILABLE = (ServiceError, NotValidNowError)  # What may be different later; e
 
 @dataclass(eq=False, slots=True)
 class Published:
-    """A machine that is published; queries for its earlier reports and events are answered from ``archive``."""
+    """A machine that is published; queries for its earlier reports and events are answered from ``archive``.
+
+    What commands decide about it is written into ``decisions``.
+    """
 
     site: str
     machine: str
     archive: HistoryWriter | None = None
+    decisions: DecisionsFile | None = None
+    desk: "CommandDesk | None" = None  # Once somebody may send commands
     latest: str | None = None  # Its report, under the lock of the publisher as what follows
     start: str | None = None
 
@@ -411,11 +422,34 @@ class Publisher:
                 answer(query, keys[topic], kind, latest, None)
 
         return (
+            *self._commanded(opened, own),
             opened.declare_queryable(keys[REPORT], partial(reply, topic=REPORT, kind="report"), complete=True),
             opened.declare_queryable(keys[EVENT], partial(reply, topic=EVENT, kind="event"), complete=True),
             opened.declare_queryable(keys[START], partial(reply, topic=START, kind="start"), complete=True),
             opened.liveliness().declare_token(ALIVE.under(own.site, own.machine)),
         )
+
+    def _commanded(self, opened: zenoh.Session, own: Published) -> tuple[Declared, ...]:
+        """Declare in a session what takes commands about a machine; nothing while nobody may send them."""
+        key, tls = COMMAND.under(own.site, own.machine), self._access.zenoh.tls
+        if own.decisions is None or tls is None or not self._access.zenoh.access.commands:
+            return ()
+        from otolith.publishing.commands.desk import CommandDesk  # noqa: PLC0415 - slow to import
+        from otolith.publishing.commands.signatures import CommandRefusedError  # noqa: PLC0415 - as above
+
+        desk = own.desk = own.desk or CommandDesk(own.site, own.machine, own.decisions)
+
+        def obey(query: zenoh.Query) -> None:
+            access, content = self._access, b"" if query.payload is None else query.payload.to_bytes()
+            ca = access.path.parent.absolute() / tls.ca
+            with self._lock:
+                latest = own.latest
+            try:
+                query.reply(key, desk.take(content, ca, access.zenoh.access.commands, latest))
+            except CommandRefusedError as error:
+                query.reply_err(str(error))
+
+        return (opened.declare_queryable(key, lambda query: self._answers.add(query, obey), complete=True),)
 
 
 def _notices(archive: HistoryWriter | None) -> dict[float, float]:

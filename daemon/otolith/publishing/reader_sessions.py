@@ -19,7 +19,12 @@ from otolith_drivers.errors import ServiceError
 QUERY_TIMEOUT = 5.0  # s
 RETRY = 0.5  # s between two looks for endpoints that answer
 MAX_CONNECTING = 32  # endpoints that are tried at the same time
+COMMAND_TIMEOUT = 8.0  # s
 MAX_HEARD = 1000  # machines of which the endpoint is kept
+
+
+class NotCarriedOutError(Exception):
+    """A command is not carried out, or nothing says whether it is; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +116,22 @@ class ReaderSessions:
             if found := list(islice(_answers(each, selector, max_bytes, refused), limit)):
                 return found
         return []
+
+    def command(self, key: str, content: bytes) -> bytes:
+        """Send a command to where its machine was heard, and return the answer of the daemon.
+
+        Raises:
+            NotCarriedOutError: the daemon refuses it, or does not answer.
+        """
+        heard = self._opened.get(self.where(key.rpartition("/")[0]))
+        refusal = ""
+        if heard is not None:
+            with contextlib.suppress(zenoh.ZError):  # the session was closed
+                for reply in heard.get(key, payload=content, timeout=COMMAND_TIMEOUT):
+                    if reply.ok is not None:
+                        return reply.ok.payload.to_bytes()
+                    refusal = refusal or (reply.err.payload.to_bytes() if reply.err else b"").decode(errors="replace")
+        raise NotCarriedOutError(refusal)
 
     def _close_all(self) -> None:
         while self._opened:

@@ -110,6 +110,9 @@ class Access:
         """Settings of TLS, once its files have been checked, and until when its certificate is valid."""
         encrypted = [endpoint for endpoint in (*listen, *self.zenoh.connect) if endpoint.startswith(ENCRYPTED)]
         if self.zenoh.tls is None:
+            if self.zenoh.access.commands:
+                remedy = "[zenoh.tls] with the ca that issues their certificates is missing"
+                raise ConfigurationError(f"nothing proves who sends a command: {remedy}", ("zenoh", "access", "commands"))
             if encrypted:
                 remedy = "[zenoh.tls] with ca, certificate and key is missing; 'otolith keys' makes them"
                 raise ConfigurationError(f"{encrypted[0]}: {remedy}", ("zenoh",))

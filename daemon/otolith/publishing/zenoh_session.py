@@ -200,6 +200,7 @@ PARAMETER = Topic("parameter/*")  # JSON object, once per window: the part of th
 EVENT = Topic("event")  # JSON, once when a window raises, changes or clears it; a query returns what it selects
 START = Topic("start")  # JSON, as a daemon that starts compiles kernels; a query returns how far it is until it is done
 ALIVE = Topic("alive")  # Liveliness token, while the daemon runs
+COMMAND = Topic("command")  # Nothing is published: a query with a signed command; declared if somebody may send them
 
 TOPICS = (REPORT, PARAMETER, EVENT, START, ALIVE)
 

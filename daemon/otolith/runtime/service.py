@@ -124,7 +124,7 @@ def _is_limit(key: Key) -> bool:
 
 
 def _is_access(key: Key) -> bool:
-    return key[:2] == ("zenoh", "tls") or key in {("zenoh", "access", "readers"), ("zenoh", "access", "passwords")}
+    return key[:2] == ("zenoh", "tls") or (key[:2] == ("zenoh", "access") and key[2:] != ("networks",))
 
 
 def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
@@ -230,7 +230,7 @@ class Service:
     def published(self) -> Published:
         """What its publisher must know of it."""
         identity = self._loaded.file.machine
-        return Published(identity.site, identity.name, self._history)
+        return Published(identity.site, identity.name, self._history, self._store.operator)
 
     @property
     def locked_out(self) -> LockedError | None:

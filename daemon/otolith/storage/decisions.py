@@ -6,8 +6,8 @@ The command line writes the file, and a running daemon reads it. State files are
 import contextlib
 import fcntl
 import os
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,6 +24,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 DECISIONS_VERSION = 4
 LOCKS = Path("/proc/locks")
 REMEDY = "move the file away to start without it"
+MAX_WAITING_NOTES = 100  # notes that no daemon has taken over; docs/reference/thresholds-storage.md has the origin
 MAX_STATE_BYTES = 8 * 1024 * 1024  # docs/reference/thresholds-storage.md has the origin
 
 StateModel = TypeVar("StateModel", bound=StrictModel)
@@ -75,6 +76,26 @@ class DecisionsFile:
                 self.write(changed(self.read()))
         except OSError as error:
             raise ServiceError(f"{self.path.parent}: cannot be used: {error.strerror}") from error
+
+    def note(
+        self,
+        noted: Callable[[Sequence[OperatorNote]], OperatorNote],
+        taken: Collection[str],
+        decided: Callable[[OperatorDecisions], OperatorDecisions] = lambda decisions: decisions,
+    ) -> None:
+        """Add the note that ``noted`` returns for those that wait for the daemon; it has taken over those ``taken``.
+
+        With it, what ``decided`` returns for the decisions is written. Raises as :meth:`change`, and ConfigurationError
+        if too many notes wait.
+        """
+
+        def changed(decisions: OperatorDecisions) -> OperatorDecisions:
+            waiting = tuple(each for each in decisions.notes if each.id not in taken)
+            if len(waiting) >= MAX_WAITING_NOTES:
+                raise ConfigurationError(f"{self.path}: {MAX_WAITING_NOTES} notes wait for the daemon: start it")
+            return replace(decided(decisions), notes=(*waiting, noted(waiting)))
+
+        self.change(changed)
 
     def learned(self) -> LearnedState | None:
         """Return what the daemon has learned, None without a file; raises as :meth:`read`."""

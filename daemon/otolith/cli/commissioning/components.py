@@ -148,8 +148,7 @@ def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorD
         known = found | decisions.approved | decisions.rejected
         if component not in known:
             raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
-        approved, rejected = decisions.approved - {component}, decisions.rejected - {component}
-        return add(replace(decisions, approved=approved, rejected=rejected))
+        return add(decisions.without(component))
 
     store.operator.change(changed)
     echo(f"{component} is {decision}")

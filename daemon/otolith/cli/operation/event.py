@@ -5,8 +5,8 @@ import pwd
 import re
 import time
 import uuid
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,13 +18,11 @@ from otolith.cli.terminal import echo, echo_json
 from otolith_drivers.outside_text import SURROGATE
 
 if TYPE_CHECKING:
-    from otolith.adaptation.state import OperatorDecisions
     from otolith.health.labels import TimeLabels
     from otolith.health.notes import OperatorNote, Shelf
     from otolith.health.schema import EventDocument
     from otolith.storage.decisions import DecisionsFile
 
-MAX_WAITING = 100  # notes that no daemon has taken over; docs/reference/thresholds-cli.md has its origin
 MAX_ACCOUNT = 32  # characters of the name of a user. Source: useradd(8)
 MACHINE = click.argument("machine", metavar="FILE|MACHINE")
 EVENT = click.argument("event")
@@ -240,20 +238,14 @@ def _do(
         end = local_time(known.labels.unix(item.end), known.zone)
         raise ConfigurationError(f"event {item.id} ended at {end}: only 'otolith event comment' is possible")
 
-    def changed(decisions: "OperatorDecisions") -> "OperatorDecisions":
-        waiting = tuple(each for each in decisions.notes if each.id not in known.taken)
-        if len(waiting) >= MAX_WAITING:
-            raise ConfigurationError(
-                f"{known.file.path}: {MAX_WAITING} notes wait for the daemon of {known.machine}: start it"
-            )
-        new = note
-        if item.end is not None and note.deed is Deed.COMMENT:
-            last = next((each.ended for each in reversed(waiting) if each.event == item.id and each.ended), item)
-            own = note.at_time(known.labels.last(now)).document
-            new = note.model_copy(update={"ended": commented(last, own)})
-        return replace(decisions, notes=(*waiting, new))
+    def noted(waiting: "Sequence[OperatorNote]") -> "OperatorNote":
+        if item.end is None or note.deed is not Deed.COMMENT:
+            return note
+        last = next((each.ended for each in reversed(waiting) if each.event == item.id and each.ended), item)
+        own = note.at_time(known.labels.last(now)).document
+        return note.model_copy(update={"ended": commented(last, own)})
 
-    known.file.change(changed)
+    known.file.note(noted, known.taken)
     _print(known, known.labels.of_event(item), note, as_json=as_json)
 
 
