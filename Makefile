@@ -61,7 +61,7 @@ conditions: $(DEV)
 
 # What readers of other programs check documents with; 'otolith schema' prints the same.
 schemas: $(DEV)
-	for kind in report event parameter health start; do \
+	for kind in $$($(BIN)/python -m otolith schema | cut -d " " -f 1); do \
 	  $(BIN)/python -m otolith schema $$kind > docs/reference/schemas/$$kind.json || exit 1; done
 
 bench: $(BENCH)

@@ -242,6 +242,15 @@ def test_a_dropped_state_closes_its_events_with_their_notes(worn: Run) -> None:
     assert [change for change in worn.windows(1, HEALTHY) if change.change is EventChange.COMMENTED] == []
 
 
+def test_what_a_person_wrote_as_a_state_is_dropped_stays_with_its_events(worn: Run) -> None:
+    """As one that rejects a component, whose event ends because of that, says who did it."""
+    worn.note(Deed.COMMENT, "rejected")
+    worn.state = worn.state.without_learned("the operator reset what was learned")
+    (cleared,) = worn.windows(1, HEALTHY)
+    assert cleared.change is EventChange.CLEARED
+    assert [note.by for note in cleared.comments or ()] == ["anna"]
+
+
 def test_times_of_notes_are_labels(worn: Run) -> None:
     worn.note(Deed.SHELVE, REASON, seconds=100.0)
     worn.note(Deed.COMMENT, "a word")

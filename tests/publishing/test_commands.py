@@ -6,7 +6,7 @@ import logging
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import pytest
 
 from otolith.adaptation.state import OperatorDecisions
 from otolith.discovery.decision import Approval
-from otolith.health.schema import ComponentDocument, ComponentStatus, EventDocument
+from otolith.health.schema import ComponentDocument, ComponentStatus, EventDocument, NumberDocument
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import Identity, make_authority, make_certificate, utc_now
 from otolith.publishing.commands.desk import MAX_COMMAND_AGE, MAX_COMMANDS, MAX_IDS, CommandDesk
@@ -34,9 +34,11 @@ from tests.waiting import wait_for
 
 LIMIT = raised()
 SINE = LIMIT.model_copy(update={"id": "component/shaft/periodic@1700000000.0"})
+AMPLITUDE = NumberDocument(value=0.004, sd=1e-4, low=0.0038, high=0.0042, unit="N m")
 COMPONENT = ComponentDocument(
     id="shaft/periodic/t", site="shaft", meaning="torque on the shaft", mode="additive", family="periodic", input="t",
-    equation="a*sin(b*t)", values={}, conditions="", domain="", status=ComponentStatus.ADOPTED, approval=Approval.OPEN,
+    equation="a*sin(b*t)", values={"amplitude": AMPLITUDE}, conditions="", domain="",
+    status=ComponentStatus.ADOPTED, approval=Approval.OPEN,
     probability=0.99, onset=1.7e9,
 )  # fmt: skip
 REPORTED = report_of(events=(LIMIT, SINE)).model_copy(update={"components": (COMPONENT,)})
@@ -204,7 +206,7 @@ def test_refusals_fill_no_log(desk: Desk, caplog: pytest.LogCaptureFixture) -> N
 @pytest.fixture
 def daemon(tmp_path: Path, keys: Path) -> Iterator[Callable[..., tuple[ReaderSessions, DecisionsFile]]]:
     """Function that starts a daemon with access rules, and returns a reader of it and its decisions."""
-    opened = []
+    opened = ExitStack()
 
     def started(**rules: Any) -> tuple[ReaderSessions, DecisionsFile]:
         endpoint, file = own_endpoint(), DecisionsFile(tmp_path / "state", SITE, MACHINE)
@@ -212,15 +214,15 @@ def daemon(tmp_path: Path, keys: Path) -> Iterator[Callable[..., tuple[ReaderSes
         access = Access(ZenohTable(tls=tls, access=AccessTable(**rules)), keys / "machine.toml")
         publisher = Publisher([Published(SITE, MACHINE, None, file)], [endpoint], access)
         reader = ReaderSessions(Connection((endpoint,)), (REPORT,), lambda _: None)
-        opened.extend([closing(publisher), closing(reader)])
+        opened.enter_context(closing(publisher))
+        opened.enter_context(closing(reader))
         reader.start()
         wait_for(lambda: bool(reader.where(f"otolith/{SITE}/{MACHINE}")))
         publisher.publish(REPORTED)
         return reader, file
 
-    yield started
-    for each in reversed(opened):
-        each.__exit__()
+    with opened:
+        yield started
 
 
 def test_a_command_comes_over_zenoh_and_its_refusal_is_told(

@@ -5,16 +5,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from jsonschema import Draft202012Validator, ValidationError
 
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, NoteDocument, ReportDocument
+from otolith.publishing.certificates import Identity, make_authority, make_certificate, utc_now
+from otolith.publishing.commands.documents import CommandAnswerDocument
+from otolith.publishing.commands.signatures import signed
 from otolith.publishing.json_schema import DOCUMENTS, schema_of
-from otolith.publishing.zenoh_session import StartDocument
+from otolith.publishing.zenoh_session import StartDocument, selection
+from otolith.site.outlets.base import Notice, Told
 from otolith.storage.history import HistoryReader
 from tests.cli.commands import otolith
+from tests.publishing.test_commands import command
 from tests.sites.machines import raised, report_of
-from tests.storage.histories import START, document
+from tests.storage.histories import MACHINE, SITE, START, document
 
 ROOT = Path(__file__).parents[2]
 HISTORIES = sorted((ROOT / "tests" / "golden" / "histories").glob("*.sqlite"))
@@ -52,6 +58,32 @@ def test_all_that_is_published_is_as_its_schema_says() -> None:
     assert report.health is not None
     checked("health", report.health.json_line())
     checked("start", StartDocument(site="a", machine="b", done=1, total=2, text="1 of 2").json_line())
+    for told in Told:
+        checked("notice", json.dumps(Notice(SITE, MACHINE, told, event).document()))
+
+
+def test_a_command_is_as_its_schema_says(tmp_path: Path) -> None:
+    make_authority(tmp_path, utc_now())
+    make_certificate(tmp_path, "site", [], utc_now())
+    own = Identity(tmp_path / "ca.crt", tmp_path / "site.crt", tmp_path / "site.key")
+    checked("command", checked("signed-command", signed(command(), own).decode())["command"])
+    checked("command-answer", CommandAnswerDocument(id="0" * 32, is_new=True).json_line())
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    ["_time=[now(-1h)..now()];limit=1", "_time=]2026-01-31T06:00:00Z..[", "after=12", "last=500", "limit=3", "",
+     "_time=now()", "after=-1", "last=x", "after=1;limit=1e3", "_time=[a]..[b]"],
+)  # fmt: skip
+def test_the_schema_of_a_query_refuses_what_a_daemon_refuses(parameters: str) -> None:
+    given = dict(pair.split("=", 1) for pair in parameters.split(";") if pair)
+    is_valid = Draft202012Validator(schema_of("history-query")).is_valid(given)
+    try:
+        selection(zenoh.Parameters(parameters), START)
+    except ValueError:
+        assert not is_valid
+    else:
+        assert is_valid
 
 
 @pytest.mark.parametrize("path", HISTORIES, ids=lambda path: path.name)

@@ -11,6 +11,7 @@ from otolith.health.schema import EventChange, EventDocument, HealthDocument, Pa
 from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import close_session, session
+from otolith.storage.decisions import DecisionsFile
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.conftest import free_port
@@ -57,11 +58,12 @@ class Daemon:
     """What a daemon does with its reports: it numbers, keeps and publishes them."""
 
     def __init__(self, folder: Path, machine: str, endpoint: str = "", access: Access = Access()) -> None:  # noqa: B008 - immutable
-        self.machine, self.endpoint = machine, endpoint
+        self.machine, self.endpoint, self.decisions = machine, endpoint, DecisionsFile(folder, SITE, machine)
         self._writer = HistoryWriter(folder / f"{SITE}.{machine}{SUFFIX}", BOUNDS)
         self._numbers, _ = self._writer.open(time.time())
         self._writer.start()
-        self._publisher = Publisher([Published(SITE, machine, self._writer)], [endpoint] if endpoint else [], access)
+        published = Published(SITE, machine, self._writer, self.decisions)
+        self._publisher = Publisher([published], [endpoint] if endpoint else [], access)
 
     def keep(self, report: ReportDocument) -> ReportDocument:
         """Number a report and keep it."""

@@ -2,12 +2,13 @@
 
 import http.client
 import socket
+import ssl
 import subprocess
 import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,8 +26,7 @@ class Answer:
 
 
 class Said:
-    """The last lines that a process wrote, read as they come: a pipe that nobody reads would block it once it is full.
-    """
+    """The last lines that a process wrote, read as they come: a full pipe that nobody reads would block it."""
 
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         self._lines: deque[str] = deque(maxlen=1000)
@@ -62,34 +62,49 @@ class Served:
     port: int
     process: "subprocess.Popen[str]" = field(repr=False)
     said: Said = field(repr=False)
+    tls: ssl.SSLContext | None = field(default=None, repr=False)
+    """With the certificate of a user, if the site is encrypted."""
 
     @property
     def address(self) -> str:
         """Of its hall."""
-        return f"http://127.0.0.1:{self.port}/"
+        return f"{'http' if self.tls is None else 'https'}://127.0.0.1:{self.port}/"
 
-    def ask(self, path: str, method: str = "GET", **headers: str) -> Answer:
+    def ask(self, path: str, method: str = "GET", content: bytes = b"", **headers: str) -> Answer:
         """Send a request with headers, and return its answer; ``host`` replaces its own."""
-        connection = self.open(path, method, **headers)
-        answer = connection.getresponse()
-        found = {name.lower(): value for name, value in answer.getheaders()}
-        text = answer.read().decode()
-        connection.close()
-        return Answer(answer.status, found, text)
+        with closing(self._connection()) as connection:
+            self._send(connection, path, method, content, headers)
+            answer = connection.getresponse()
+            found = {name.lower(): value for name, value in answer.getheaders()}
+            return Answer(answer.status, found, answer.read().decode())
 
     def open(self, path: str, method: str = "GET", **headers: str) -> http.client.HTTPConnection:
         """Send a request, and return its connection."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        connection = self._connection()
+        self._send(connection, path, method, b"", headers)
+        return connection
+
+    def _connection(self) -> http.client.HTTPConnection:
+        if self.tls is None:
+            return http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        return http.client.HTTPSConnection("127.0.0.1", self.port, timeout=PATIENCE, context=self.tls)
+
+    def _send(
+        self, connection: http.client.HTTPConnection, path: str, method: str, content: bytes, headers: dict[str, str]
+    ) -> None:
+        if content:
+            headers = {"content_length": f"{len(content)}", **headers}
         own = {"host": f"127.0.0.1:{self.port}"} | {name.replace("_", "-"): value for name, value in headers.items()}
         connection.putrequest(method, path, skip_host=True)
         for name, value in own.items():
             connection.putheader(name, value)
-        connection.endheaders()
-        return connection
+        connection.endheaders(content or None)
 
 
 @contextmanager
-def serving(folder: Path, *endpoints: str, more: str = "", tables: str = "") -> Iterator[Served]:
+def serving(
+    folder: Path, *endpoints: str, more: str = "", tables: str = "", tls: ssl.SSLContext | None = None
+) -> Iterator[Served]:
     """A site that reads endpoints; ``more`` are lines at the begin of its file, ``tables`` at its end."""
     port = free_port(socket.SOCK_STREAM)
     file = folder / "site.toml"
@@ -100,8 +115,9 @@ def serving(folder: Path, *endpoints: str, more: str = "", tables: str = "") -> 
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = Said(process)
-            assert f"http://127.0.0.1:{port}/" in said.first(), said.now()
-            yield Served(port, process, said)
+            served = Served(port, process, said, tls)
+            assert served.address in said.first(), said.now()
+            yield served
         finally:
             process.terminate()
             process.wait(PATIENCE)

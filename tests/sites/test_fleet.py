@@ -15,13 +15,16 @@ import zenoh
 
 from otolith.health.limits import Level
 from otolith.machine_file import ZenohTable
-from otolith.publishing.certificates import make_authority, make_certificate, utc_now
+from otolith.publishing.certificates import Identity, make_authority, make_certificate, utc_now
+from otolith.publishing.commands.signatures import signed
+from otolith.publishing.reader_sessions import NotCarriedOutError, ReaderSessions
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import TLS, Access, Connection, Credentials, reader_settings
-from otolith.publishing.zenoh_session import close_session, session
+from otolith.publishing.zenoh_session import COMMAND, REPORT, close_session, session
 from otolith_drivers.errors import ServiceError
 from tests.cli.commands import otolith
 from tests.conftest import free_port
+from tests.publishing.test_commands import LIMIT, command
 from tests.sites.machines import Daemon, report_of, sent
 from tests.sites.serving import router, serving
 from tests.storage.histories import MACHINE, SITE
@@ -87,9 +90,10 @@ class Fleet:
         endpoint = self.endpoint(router)
         return session((), [endpoint], reader_settings(self.credentials(name, folder), [endpoint]), "client")
 
-    def machine(self, machine: str = MACHINE) -> Daemon:
-        """The daemon of the machine file of the page."""
+    def machine(self, machine: str = MACHINE, commands: tuple[str, ...] = ()) -> Daemon:
+        """The daemon of the machine file of the page; ``commands`` are who may send them."""
         table = ZenohTable.model_validate(tomllib.loads(self.block("toml", "[zenoh.tls]"))["zenoh"])
+        table = table.model_copy(update={"access": table.access.model_copy(update={"commands": commands})})
         return Daemon(self.folder, machine, access=Access(table, self.folder / "machine.toml"))
 
     def router(self, name: str) -> AbstractContextManager[None]:
@@ -149,6 +153,25 @@ def test_reports_pass_both_routers_and_come_once_in_order_after_one_was_away(fle
         served = stack.enter_context(serving(tmp_path, *table["connect"], tables=files))  # one that starts later
         wait_for(lambda: 'id="count-ACT">1<' in served.ask("/").text)
         assert served.ask(f"/machine/{SITE}/{MACHINE}").status == 200
+
+
+def test_a_signed_command_passes_both_routers_and_the_daemon_knows_who_sent_it(fleet: Fleet) -> None:
+    endpoint, files = fleet.endpoint("plant"), fleet.folder / "keys"
+    with ExitStack() as stack:
+        stack.enter_context(fleet.router("cell-1"))
+        daemon = stack.enter_context(closing(fleet.machine(commands=("site",))))
+        reader = ReaderSessions(Connection((endpoint,), fleet.credentials("site")), (REPORT,), lambda _: None)
+        stack.enter_context(closing(reader))
+        reader.start()
+        wait_for(lambda: bool(reader.where(f"otolith/{SITE}/{MACHINE}")))
+        daemon.publish(report_of(end=time.time(), events=(LIMIT,)))
+        for name in ("plant", "press-3"):
+            own = Identity(files / "ca.crt", files / f"{name}.crt", files / f"{name}.key")
+            with pytest.raises(NotCarriedOutError):
+                reader.command(COMMAND.under(SITE, MACHINE), signed(command(), own))
+        own = Identity(files / "ca.crt", files / "site.crt", files / "site.key")
+        assert b"true" in reader.command(COMMAND.under(SITE, MACHINE), signed(command(), own))
+        assert [note.by for note in daemon.decisions.read().notes] == ["anna (site)"]
 
 
 def fleet_is_alive(fleet: Fleet) -> bool:

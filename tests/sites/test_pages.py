@@ -197,7 +197,7 @@ def test_a_search_is_written_back_as_text(site: Served) -> None:
     ],
 )
 def test_what_is_not_for_the_site_is_refused(site: Served, headers: dict[str, str], method: str, status: int) -> None:
-    assert site.ask("/", method, **headers).status == status
+    assert site.ask("/", method, b"", **headers).status == status
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``otolith schema``: JSON Schema of what daemons publish over Zenoh."""
+"""``otolith schema``: JSON Schema of what is sent over Zenoh, and to other systems."""
 
 import click
 
@@ -8,10 +8,11 @@ from otolith.cli.terminal import echo, echo_json
 @click.command()
 @click.argument("name", metavar="[NAME]", required=False)
 def schema(name: str | None) -> None:
-    """Print the JSON Schema of what daemons publish over Zenoh.
+    """Print the JSON Schema of a kind of document.
 
-    NAME is the kind of a document: report, event, parameter, health or start.
-    Without it, prints the kinds, the version of each, and its key.
+    NAME is the kind, such as report, event or command: what is sent over
+    Zenoh, and to other systems. Without it, prints the kinds, the version of
+    each, and where it is.
 
     \b
     Examples:
@@ -23,8 +24,8 @@ def schema(name: str | None) -> None:
 
     if name is None:
         for kind, own in DOCUMENTS.items():
-            place = own.topic.under("<site>", "<machine>", "<name>") if own.topic else "a part of the report"
-            echo(f"{kind:<10} {own.version_of(kind):<20} {place}")
+            place = own.topic.under("<site>", "<machine>", "<name>") if own.topic else own.place
+            echo(f"{kind:<14} {own.version_of(kind):<24} {place}")
         return
     if name not in DOCUMENTS:
         raise click.BadParameter(

@@ -32,6 +32,7 @@ def site(file: Path | None, verbose: bool) -> int:
 
     if lacking := [name for name in EXTRA if importlib.util.find_spec(name) is None]:
         raise ServiceError(f"{', '.join(lacking)} is missing: {installation_of('site')}")
+    from otolith.site.access.users import access_of
     from otolith.site.collector import Collector
     from otolith.site.outlets.base import OutletSetup
     from otolith.site.outlets.table import runners_of
@@ -42,11 +43,16 @@ def site(file: Path | None, verbose: bool) -> int:
     folder = Path() if file is None else file.parent.absolute()
     try:
         settings, source = (SiteFile(), None) if file is None else load_site(file)
+        access = access_of(settings, folder)
         collector = Collector(settings.connection(folder), settings.machines)
         setup = OutletSetup(folder, settings.title, settings.language, settings.timezone)
         outlets = runners_of(settings.outlets, setup, collector, source)
     except ConfigurationError as error:
         error.exit_code = os.EX_CONFIG  # as 'otolith run', so that systemd does not start it again
         raise
-    ended_by = run_site(collector, settings, outlets, lambda address: echo(f"{address}; Ctrl-C ends it", err=True))
+
+    def ready(address: str) -> None:
+        echo(f"{address}; Ctrl-C ends it", err=True)
+
+    ended_by = run_site(collector, settings, outlets, ready, access)
     return INTERRUPTED if ended_by == signal.SIGINT else 0

@@ -14,17 +14,7 @@ from otolith.discovery.alternatives import ACCEPTED, NO_EVIDENCE, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import MonitoringPlan, diagnose
 from otolith.health.limits import MACHINE, Coldness, Level, MonitoredQuantity
-from otolith.health.notes import (
-    Deed,
-    OperatorNote,
-    Shelf,
-    commented,
-    ended_events,
-    lasting,
-    noted,
-    of_event,
-    shelved_until,
-)
+from otolith.health.notes import Deed, OperatorNote, Shelf, ended_events, lasting, noted, of_event, shelved_until
 from otolith.health.observations import (
     BUS,
     COLDER,
@@ -225,8 +215,9 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
                 record = replace(record, event=None, cleared=report.window.index)
         if not record.is_over(report.window.index):
             records[key] = record
-    events += [_ended(plan, event, report.window.start, of_event(state.notes, event.id)) for event in state.dropped]
-    events += ended_events(state.notes)
+    dropped, ended = ended_events(state.notes, state.dropped)
+    events += [_ended(plan, event, report.window.start) for event in dropped]
+    events += ended
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
@@ -481,10 +472,8 @@ def _deciding_limit(
     return before.held if level is before.level else event.evidence.limit
 
 
-def _ended(plan: MonitoringPlan, event: EventDocument, now: float, notes: Iterable[OperatorNote]) -> EventDocument:
+def _ended(plan: MonitoringPlan, event: EventDocument, now: float) -> EventDocument:
     """Return a dropped event as it is cleared, with what persons wrote to it meanwhile."""
-    for note in notes:
-        event = commented(event, note.document) if note.deed is Deed.COMMENT else event
     reason = plan.texts.translated(event.reason or "")
     update = {"change": EventChange.CLEARED, "end": max(event.since, now), "reason": reason}
     return event.model_copy(update={**update, "sequence": None, "previous": None})

@@ -5,7 +5,7 @@ soon as its level is worse than when it was shelved, or its diagnosis another on
 as they are. Times are those of the windows.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -128,11 +128,21 @@ def commented(event: EventDocument, note: NoteDocument) -> EventDocument:
     return event.model_copy(update={"comments": (*(event.comments or ()), note)[-MAX_COMMENTS:]})
 
 
-def ended_events(notes: Iterable[OperatorNote]) -> tuple[EventDocument, ...]:
-    """Return the events that were over when persons commented on them, with the comments."""
+Events = tuple[EventDocument, ...]
+
+
+def ended_events(notes: Sequence[OperatorNote], dropped: Iterable[EventDocument]) -> tuple[Events, Events]:
+    """Return the ``dropped`` events, and those that were over when persons commented on them, with the comments."""
     ended = {note.event: note.ended for note in notes if note.ended is not None}  # the last has all comments
     update = {"change": EventChange.COMMENTED, "sequence": None, "previous": None}
-    return tuple(event.model_copy(update=update) for event in ended.values())
+    over = tuple(event.model_copy(update=update) for event in ended.values())
+    return tuple(_with_comments(event, of_event(notes, event.id)) for event in dropped), over
+
+
+def _with_comments(event: EventDocument, notes: Iterable[OperatorNote]) -> EventDocument:
+    for note in notes:
+        event = commented(event, note.document) if note.deed is Deed.COMMENT else event
+    return event
 
 
 def of_event(notes: Iterable[OperatorNote], event_id: str) -> list[OperatorNote]:

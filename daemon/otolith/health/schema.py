@@ -199,6 +199,26 @@ class EventDocument(DocumentModel):
         return self.state is Level.HINT
 
 
+class NoticeDocument(DocumentModel):
+    """What is told of an event, or of a machine that fell silent, to other systems."""
+
+    schema_: Literal["otolith.notice/1"] = "otolith.notice/1"
+    key: str  # The same for each try to pass this notice on, and for no other notice
+    site: str
+    machine: str
+    told: Literal["raised", "worse", "better", "cleared"]
+    state: Level  # NO DATA of silence, OK once it is cleared
+    part: str | None = None
+    condition: str | None = None
+    text: str | None = None
+    cause: str | None = None
+    advice: str | None = None
+    start: float  # Unix seconds, as since and end
+    since: float  # Begin of the present state
+    end: float | None = None
+    event: str  # Id of the event, the same from raised to cleared
+
+
 class PartDocument(DocumentModel):
     """State of a part or of the machine."""
 

@@ -14,12 +14,23 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
-from otolith.health.schema import EventDocument, HealthDocument, ParameterDocument, ReportDocument
-from otolith.publishing.zenoh_session import EVENT, PARAMETER, REPORT, START, StartDocument, Topic
+from otolith.health.schema import EventDocument, HealthDocument, NoticeDocument, ParameterDocument, ReportDocument
+from otolith.publishing.commands.documents import CommandAnswerDocument, CommandDocument, SignedCommandDocument
+from otolith.publishing.zenoh_session import (
+    COMMAND,
+    EVENT,
+    PARAMETER,
+    REPORT,
+    START,
+    HistoryQueryDocument,
+    StartDocument,
+    Topic,
+)
 from otolith_drivers.config_files import DocumentModel
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _COMMENT = re.compile(r"^    (\w+): [^#\n]*#\s*([^\n]*)$", re.MULTILINE)
+_DOCSTRING = re.compile(r'^    (\w+): [^\n]*\n    """([^"]*)"""$', re.MULTILINE)
 _MARKUP = re.compile(r":\w+:`([^`]*)`|``([^`]*)``")
 
 
@@ -28,8 +39,9 @@ class PublishedDocument:
     """A kind of document, and where it is published."""
 
     model: type[DocumentModel]
-    topic: Topic | None  # None of a part of another one
+    topic: Topic | None  # None of what is not published under a key of its own
     version: int = 1  # Another one once a key is gone or means something else
+    place: str = "a part of the report"  # Without a topic
 
     def version_of(self, name: str) -> str:
         """Return kind and version, as a report has it at ``schema``."""
@@ -42,6 +54,11 @@ DOCUMENTS: Mapping[str, PublishedDocument] = {
     "parameter": PublishedDocument(ParameterDocument, PARAMETER),
     "health": PublishedDocument(HealthDocument, None),
     "start": PublishedDocument(StartDocument, START),
+    "history-query": PublishedDocument(HistoryQueryDocument, None, place="parameters of a query of report and event"),
+    "signed-command": PublishedDocument(SignedCommandDocument, None, place="payload of a query of command"),
+    "command": PublishedDocument(CommandDocument, None, place="a part of signed-command"),
+    "command-answer": PublishedDocument(CommandAnswerDocument, COMMAND),
+    "notice": PublishedDocument(NoticeDocument, None, place="what the outlets of a site send"),
 }
 
 
@@ -83,7 +100,9 @@ class _Generator(GenerateJsonSchema):
 def _comments(model: type[BaseModel]) -> dict[str, str]:
     """Return what the comments of the fields say, also of those that a model inherits."""
     sources = [inspect.getsource(each) for each in reversed(model.__mro__) if each.__module__.startswith("otolith")]
-    return {name: _plain(text) for source in sources for name, text in _COMMENT.findall(source)}
+    rows = (row for source in sources for form in (_COMMENT, _DOCSTRING) for row in form.findall(source))
+    names = {name: own.alias or name for name, own in model.model_fields.items()}
+    return {names.get(name, name): _plain(" ".join(text.split())) for name, text in rows}
 
 
 def _plain(text: str) -> str:

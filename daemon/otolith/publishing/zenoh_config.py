@@ -111,8 +111,8 @@ class Access:
         encrypted = [endpoint for endpoint in (*listen, *self.zenoh.connect) if endpoint.startswith(ENCRYPTED)]
         if self.zenoh.tls is None:
             if self.zenoh.access.commands:
-                remedy = "[zenoh.tls] with the ca that issues their certificates is missing"
-                raise ConfigurationError(f"nothing proves who sends a command: {remedy}", ("zenoh", "access", "commands"))
+                text = "nothing proves who sends a command: [zenoh.tls] with the ca of their certificates is missing"
+                raise ConfigurationError(text, ("zenoh", "access", "commands"))
             if encrypted:
                 remedy = "[zenoh.tls] with ca, certificate and key is missing; 'otolith keys' makes them"
                 raise ConfigurationError(f"{encrypted[0]}: {remedy}", ("zenoh",))

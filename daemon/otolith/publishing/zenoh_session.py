@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import zenoh
+from pydantic import Field
 
 from otolith.publishing.zenoh_config import (
     ENCRYPTED,
@@ -46,6 +47,22 @@ _RANGE = re.compile(r"([\[\]])([^\[\]]*)\.\.([^\[\]]*)([\[\]])")
 _NOW = re.compile(r"now\(\s*(?:([+-]?[0-9.]+)\s*(u|ms|s|m|h|d|w|))?\s*\)")
 
 
+NUMBER = r"[0-9]{1,18}"
+
+
+class HistoryQueryDocument(DocumentModel):
+    """What a query of ``report`` or ``event`` selects in the history: the parameters behind ``?`` in its selector.
+
+    Between two of them is ``;``. Without ``_time``, ``after`` and ``last`` it is of the latest report.
+    """
+
+    time: str | None = Field(default=None, alias="_time", pattern=rf"^\s*{_RANGE.pattern}\s*$")
+    """As Zenoh writes it, ``[now(-1h)..now()]`` or ``[2026-01-31T06:00:00Z..]``; outward brackets exclude a bound."""
+    after: str | None = Field(default=None, pattern=f"^{NUMBER}$")  # Only documents with a higher ``sequence``
+    limit: str | None = Field(default=None, pattern=f"^{NUMBER}$")  # The first ones; at most 1000
+    last: str | None = Field(default=None, pattern=f"^{NUMBER}$")  # The last ones; at most 1000
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """What a query asks for."""
@@ -63,7 +80,7 @@ def selection(parameters: zenoh.Parameters, now: float) -> Selection | None:
         return None
     start, end = (None, None) if span is None else time_range(span, now)
     for name, text in (("after", after), ("limit", limit), ("last", last)):
-        if text is not None and not re.fullmatch(r"[0-9]{1,18}", text):
+        if text is not None and not re.fullmatch(NUMBER, text):
             what = "a sequence number" if name == "after" else f"a number of documents, at most {MAX_REPLIES}"
             raise ValueError(f"{name}={text}: write {what}")
     count = min(int(last or limit or MAX_REPLIES), MAX_REPLIES)

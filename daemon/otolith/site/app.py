@@ -10,17 +10,22 @@ from typing import Any
 from urllib.parse import urlencode, urlsplit
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from otolith.health.schema import LANGUAGES, Language
+from otolith.health.text import report_in, texts_in
 from otolith.health.times import moment_text
+from otolith.site.access.offers import offers_of
+from otolith.site.access.orders import MAX_FORM, OrderOutcome, Orders
+from otolith.site.access.users import User
 from otolith.site.collector import Collector
 from otolith.site.compare import peers, poor_data, week
 from otolith.site.daemons import certificates, own_certificate, versions
 from otolith.site.hall import PAGES, Filter, Hall, Shown
+from otolith.site.known import KnownMachine
 from otolith.site.metrics import CONTENT_TYPE, Metrics
 from otolith.site.outlets.base import OutletStatus
 from otolith.site.past import FIRST_SPAN, SPANS
@@ -30,6 +35,7 @@ from otolith.site.serving.past_pages import PastPages
 from otolith.site.serving.pieces import Pieces
 from otolith.site.settings import OWN_HOSTS, SiteFile
 from otolith.site.words import accepted, words_in
+from otolith_drivers.outside_text import visible
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MAX_AGE = 0.5  # s of the hall, of metrics and of the health that are given to several who ask
@@ -37,6 +43,10 @@ MAX_COMPARISON_AGE = 5.0  # s of a comparison
 REFRESH = 30  # s after which a browser asks for the page of a machine again
 BUSY_REFRESH = 5  # s after which it asks again if many look at the past
 MAX_QUERY = 512  # characters of the query of an address
+FORM_TIME = 10.0  # s for a browser to send a form
+MAX_SENDING = 4  # commands that are sent at a time
+MAX_REASON = 500  # characters of why a daemon refuses a command
+COMMAND = "/command"
 FIRST_PEERS = 8  # machines of a parameter that are seen at once, with those that differ
 HTML = "text/html"
 Show = Callable[[Request], Awaitable[Response]]
@@ -52,15 +62,22 @@ HEADERS = {
 }
 
 OWN_POLICY = "content-security-policy"
-REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; frame-ancestors 'none'"
+REPORT_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; frame-ancestors 'none'; "
+    "form-action 'self'"
+)
 """Of a report page: it places its curves and lanes by styles of their elements, and has no script at all."""
 
 
 class Guard:
-    """Refuses what is not for the site: other names, other origins, writing methods, long queries."""
+    """Refuses what is not for the site: other names, other origins, writing methods, long queries.
 
-    def __init__(self, app: ASGIApp, hosts: tuple[str, ...]) -> None:
+    If it ``takes_commands``, these are sent by the pages of the site itself, and by no others.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: tuple[str, ...], *, takes_commands: bool = False) -> None:
         self._app, self._hosts = app, frozenset(host.lower() for host in (*OWN_HOSTS, *hosts))
+        self._takes_commands = takes_commands
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse."""
@@ -87,11 +104,15 @@ class Guard:
         hosts = [value for name, value in headers if name == b"host"]
         if len(hosts) != 1 or host_named(hosts[0]) not in self._hosts:
             return 421, "this site has another name: http.hosts of its file lists the names that it answers to"
-        if scope["method"] not in ("GET", "HEAD"):
+        origins = [value for name, value in headers if name == b"origin"]
+        if scope["method"] == "POST" and self._takes_commands and scope["path"] == COMMAND:
+            sites = {value for name, value in headers if name == b"sec-fetch-site"}
+            if origins != [f"{scope['scheme']}://{hosts[0].lower()}"] or sites - {"same-origin"}:
+                return 403, "a command is sent by a page of this site only"
+        elif scope["method"] not in ("GET", "HEAD"):
             return 405, "the site is read only"
-        for origin in (value for name, value in headers if name == b"origin"):
-            if _place(origin) != hosts[0].lower():
-                return 403, "this request comes from the page of another site"
+        elif any(_place(origin) != hosts[0].lower() for origin in origins):
+            return 403, "this request comes from the page of another site"
         if len(scope["query_string"]) > MAX_QUERY:
             return 414, f"the query has more than {MAX_QUERY} characters"
         return None
@@ -116,8 +137,13 @@ def host_named(header: str) -> str:
 class SitePages:
     """The handlers of all addresses. The loop takes no lock: what needs it is made in other threads."""
 
-    def __init__(self, collector: Collector, settings: SiteFile, outlets: Sequence[OutletStatus] = ()) -> None:
-        self._collector, self._settings, self._outlets = collector, settings, outlets
+    def __init__(
+        self, collector: Collector, settings: SiteFile, outlets: Sequence[OutletStatus] = (),
+        orders: Orders | None = None,
+    ) -> None:  # fmt: skip
+        """Without ``orders`` nobody may send commands."""
+        self._collector, self._settings, self._outlets, self._orders = collector, settings, outlets, orders
+        self._sending = ThreadPoolExecutor(MAX_SENDING, "send-command")
         self._hall, self._scrape = Hall(collector.knowledge, settings.timezone), Metrics(collector.knowledge)
         self._live, self._turns = asyncio.Semaphore(MAX_LIVE), Turns()
         self._past = PastPages(collector, settings.timezone)
@@ -138,9 +164,11 @@ class SitePages:
             Route("/metrics", self._show_metrics), Route("/healthz", self._show_health),
             *(Route(path, self._in_turn(show)) for path, show in pages.items()),
             *(Route(f"/{name}", self._in_turn(_static(name, kind))) for name, kind in STATIC.items()),
+            Route(COMMAND, self._in_turn(self._take_order), methods=["POST"]),
         ]  # fmt: skip
         handlers: Mapping[Any, Callable[[Request, Exception], Awaitable[Response]]] = {404: self._show_nothing}
-        return Guard(Starlette(routes=routes, exception_handlers=dict(handlers)), self._settings.http.hosts)
+        whole = Starlette(routes=routes, exception_handlers=dict(handlers))
+        return Guard(whole, self._settings.http.hosts, takes_commands=self._orders is not None)
 
     def _in_turn(self, show: Show) -> Show:
         async def shown(request: Request) -> Response:
@@ -206,7 +234,37 @@ class SitePages:
             site=site, machine=name, spans=SPANS, span=span, past=page.past, language=language, **self._frame(language)
         )
         headers = {OWN_POLICY: REPORT_POLICY, "refresh": f"{REFRESH}"}
-        return Pieces([page.head, nav.encode(errors="replace"), page.rest], HTML, headers=headers)
+        own = self._commands(request, known, language)
+        parts = [page.head, nav.encode(errors="replace"), page.top, own.encode(errors="replace"), page.rest]
+        return Pieces(parts, HTML, headers=headers)
+
+    def _commands(self, request: Request, machine: KnownMachine, language: Language) -> str:
+        """Return what can be commanded about a machine: lines to read out, and buttons for a user who may send them."""
+        offered = [] if machine.report is None else offers_of(report_in(machine.report, language))
+        user, fields = _user(request), None
+        if self._orders is not None and user is not None and self._orders.may(user):
+            fields = partial(self._orders.fields, user)
+        own = {"site": machine.site, "machine": machine.name, "offered": offered, "fields": fields, "user": user}
+        return PAGES.get_template("commands.html").render(
+            own, path=COMMAND, texts=texts_in(language), language=language, words=words_in(language)
+        )
+
+    async def _take_order(self, request: Request) -> Response:
+        """Send the command of a form, and say what came of it."""
+        language, content = self._language(request), await _form(request)
+        if self._orders is None or content is None:
+            return await self._message(language, "order_form", 400)
+        loop = asyncio.get_running_loop()
+        return self._told(
+            await loop.run_in_executor(self._sending, self._orders.give, _user(request), content), language
+        )
+
+    def _told(self, outcome: OrderOutcome, language: Language) -> Response:
+        text = words_in(language)[outcome.word].format(reason=visible(outcome.reason, MAX_REASON))
+        page = PAGES.get_template("message.html").render(
+            text=text, here="order", machine=outcome.machine, language=language, refused={}, **self._frame(language)
+        )
+        return HTMLResponse(page, outcome.status)
 
     async def _show_nothing(self, request: Request, _: Exception) -> Response:
         await self._turns.take()
@@ -240,6 +298,25 @@ class SitePages:
 
     async def _show_live(self, request: Request) -> Response:
         return Live(self._halls[self._language(request)].get, _filter(request), self._live)
+
+
+def _user(request: Request) -> User | None:
+    user = getattr(request.state, "user", None)
+    return user if isinstance(user, User) else None
+
+
+async def _form(request: Request) -> bytes | None:
+    """Return what a browser sends; None of too much, or if it comes too slowly."""
+    content = bytearray()
+    try:
+        async with asyncio.timeout(FORM_TIME):
+            async for part in request.stream():
+                content += part
+                if len(content) > MAX_FORM:
+                    return None
+    except (TimeoutError, ClientDisconnect):
+        return None
+    return bytes(content)
 
 
 def _filter(request: Request) -> Filter:

@@ -77,6 +77,10 @@ class Collector:
         """Return what daemons answer to a query: at most ``limit`` documents, and no more than a few megabytes."""
         return [content for _, content in self._sessions.get(selector, limit, MAX_ANSWER_BYTES, refused)]
 
+    def command(self, key: str, content: bytes) -> bytes:
+        """Send a signed command to a daemon, and return its answer; raise NotCarriedOutError if there is none."""
+        return self._sessions.command(key, content)
+
     def _put(self, arrival: Arrival) -> None:
         try:
             self._waiting.put_nowait((arrival, False))

@@ -3,6 +3,7 @@
 import asyncio
 import signal
 import socket
+import ssl
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +13,8 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from otolith.publishing.zenoh_config import raise_descriptor_limit
+from otolith.site.access.orders import Orders
+from otolith.site.access.users import Loop, SiteAccess, user_of
 from otolith.site.app import SitePages
 from otolith.site.collector import Collector
 from otolith.site.outlets.runner import OutletRunner
@@ -40,6 +43,7 @@ class _Patient(H11Protocol):
         transport.set_write_buffer_limits(high=MAX_UNREAD)
         self._phase: tuple[object, bool] = (None, True)  # Its request, and whether it waits for the next one
         self._since = self.loop.time()  # When it last came on
+        self.app_state = {**self.app_state, "user": user_of(transport)}
         if len(self.connections) > MAX_CONNECTIONS:
             self._make_room()
 
@@ -120,12 +124,13 @@ class Server(uvicorn.Server):
                 each.cut()
 
 
-def server_of(app: ASGIApp) -> Server:
-    """Return what serves an application."""
+def server_of(app: ASGIApp, tls: ssl.SSLContext | None = None) -> Server:
+    """Return what serves an application, encrypted if ``tls`` is given."""
     return Server(uvicorn.Config(
         app, http=_Patient, ws="none", lifespan="off", log_config=None, access_log=False, server_header=False,
         date_header=True, limit_concurrency=MAX_CONNECTIONS + ACCEPTED, backlog=ACCEPTED,
         timeout_keep_alive=round(PATIENCE), timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
+        ssl_context_factory=None if tls is None else lambda *_: tls,
     ))  # fmt: skip
 
 
@@ -144,23 +149,31 @@ def listening_on(address: tuple[str, int]) -> socket.socket:
 
 
 def run_site(
-    collector: Collector, settings: SiteFile, outlets: list[OutletRunner], ready: Callable[[str], None]
+    collector: Collector,
+    settings: SiteFile,
+    outlets: list[OutletRunner],
+    ready: Callable[[str], None],
+    access: SiteAccess | None = None,
 ) -> int:
     """Serve until SIGTERM or SIGINT, and return its number; ``ready`` is told the address once it is listened on.
+
+    With ``access`` connections are encrypted, and users may send commands.
 
     Raises:
         ServiceError: the address cannot be listened on.
     """
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH)
-    pages = SitePages(collector, settings, [outlet.status for outlet in outlets])
-    server = server_of(pages.app())
+    orders = None if access is None else Orders(access.users, access.signer, collector.command)
+    pages = SitePages(collector, settings, [outlet.status for outlet in outlets], orders)
+    server = server_of(pages.app(), None if access is None else access.tls)
     try:
         listening = listening_on(settings.http.address)
     except OSError as error:
         remedy = "set http.listen to another address"
         raise ServiceError(f"http.listen = {settings.http.listen}: {error.strerror}; {remedy}") from error
     with listening, collector, running(outlets):
-        ready(f"http://{settings.http.listen}/")
-        asyncio.run(server.serve([listening]))
+        ready(f"{'http' if access is None else 'https'}://{settings.http.listen}/")
+        with asyncio.Runner(loop_factory=Loop) as runner:
+            runner.run(server.serve([listening]))
     return server.ended_by

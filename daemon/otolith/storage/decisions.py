@@ -27,7 +27,13 @@ REMEDY = "move the file away to start without it"
 MAX_WAITING_NOTES = 100  # notes that no daemon has taken over; docs/reference/thresholds-storage.md has the origin
 MAX_STATE_BYTES = 8 * 1024 * 1024  # docs/reference/thresholds-storage.md has the origin
 
+Decide = Callable[[OperatorDecisions], OperatorDecisions]
 StateModel = TypeVar("StateModel", bound=StrictModel)
+
+
+def unchanged(decisions: OperatorDecisions) -> OperatorDecisions:
+    """Return the decisions."""
+    return decisions
 
 
 class _DecisionsContent(StrictModel):
@@ -65,7 +71,7 @@ class DecisionsFile:
         file = _DecisionsContent.model_validate({**asdict(decisions), **keys})
         write_model(self.path, file, f"{self.path.name}.{os.getpid()}.new")
 
-    def change(self, changed: Callable[[OperatorDecisions], OperatorDecisions]) -> None:
+    def change(self, changed: Decide) -> None:
         """Write what ``changed`` returns for the decisions; two commands at once do not lose what the other wrote.
 
         Raises as :meth:`read` and :meth:`write`.
@@ -81,7 +87,7 @@ class DecisionsFile:
         self,
         noted: Callable[[Sequence[OperatorNote]], OperatorNote],
         taken: Collection[str],
-        decided: Callable[[OperatorDecisions], OperatorDecisions] = lambda decisions: decisions,
+        decided: Decide = unchanged,
     ) -> None:
         """Add the note that ``noted`` returns for those that wait for the daemon; it has taken over those ``taken``.
 

@@ -20,7 +20,7 @@ from otolith.health.schema import ComponentDocument, EventDocument, ReportDocume
 from otolith.publishing.certificates import authorities
 from otolith.publishing.commands.documents import CommandAnswerDocument, CommandDocument, CommandKind
 from otolith.publishing.commands.signatures import CommandRefusedError, verified
-from otolith.storage.decisions import DecisionsFile
+from otolith.storage.decisions import Decide, DecisionsFile, unchanged
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.outside_text import SURROGATE
 
@@ -64,7 +64,7 @@ class CommandDesk:
             try:
                 return self._taken(content, ca, senders, latest)
             except OtolithError as error:
-                log.error("a command is not carried out: %s", error)
+                log.warning("a command is not carried out: %s", error)
                 raise CommandRefusedError("the daemon cannot write it: its log has the reason") from error
             except CommandRefusedError as error:
                 if (now := self._clock()) - self._told >= REFUSAL_PAUSE:
@@ -111,7 +111,8 @@ class CommandDesk:
         events = {} if report is None else {each.id: each for each in report.events if each.end is None}
         if report is None or command.event not in events:
             raise CommandRefusedError(f"no event {command.event!r} is open: look at the page again")
-        deed, text, decided = Deed.ACKNOWLEDGE, "", _nothing
+        deed, text = Deed.ACKNOWLEDGE, ""
+        decided: Decide = unchanged
         if command.kind is not CommandKind.ACKNOWLEDGE:
             component = component_of(report, events[command.event])
             if component is None:
@@ -131,11 +132,7 @@ def component_of(report: ReportDocument, event: EventDocument) -> ComponentDocum
     return found[0] if len(found) == 1 else None
 
 
-def _nothing(decisions: OperatorDecisions) -> OperatorDecisions:
-    return decisions
-
-
-def _decision(kind: CommandKind, component: str) -> Callable[[OperatorDecisions], OperatorDecisions]:
+def _decision(kind: CommandKind, component: str) -> Decide:
     def decided(decisions: OperatorDecisions) -> OperatorDecisions:
         rest = decisions.without(component)
         if kind is CommandKind.APPROVE:

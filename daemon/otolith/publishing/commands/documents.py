@@ -38,7 +38,7 @@ class CommandDocument(DocumentModel):
 class SignedCommandDocument(DocumentModel):
     """A command as it is sent: the payload of a query for ``command``. Text and signature are byte for byte the same.
 
-    The signature is of SHA-256 of ``otolith.command/1``, a line feed and the text, by ECDSA or by RSA with PKCS #1 v1.5.
+    The signature is of SHA-256 of ``otolith.command/1``, a line feed and the text, by ECDSA or RSA (PKCS #1 v1.5).
     """
 
     command: str  # The command, a JSON text

@@ -94,4 +94,3 @@ def _check(certificate: x509.Certificate, signature: bytes, content: bytes) -> N
         public.verify(signature, content, padding.PKCS1v15(), hashes.SHA256())
     else:
         raise InvalidSignature
-

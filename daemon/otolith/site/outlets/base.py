@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from otolith.health.limits import Level
-from otolith.health.schema import EventDocument, Language, ReportDocument
+from otolith.health.schema import EventDocument, Language, NoticeDocument, ReportDocument
 from otolith.site.known import KnownMachine, RefusedFor
-
-SCHEMA = "otolith.notice/1"
 
 
 class OutletError(Exception):
@@ -72,12 +70,14 @@ class Notice:
     def document(self) -> Mapping[str, Any]:
         """Return it as a document: ``otolith.notice/1``."""
         event = self.event
-        state = Level.OK if self.told is Told.CLEARED else event.state
-        own = {"schema": SCHEMA, "key": self.key, "site": self.site, "machine": self.machine, "told": str(self.told),
-               "state": str(state), "part": event.part, "condition": event.condition, "text": event.text,
-               "cause": event.cause, "advice": event.advice, "start": event.start, "since": event.since,
-               "end": event.end, "event": event.id}  # fmt: skip
-        return {name: value for name, value in own.items() if value not in (None, "")}
+        own = NoticeDocument(
+            key=self.key, site=self.site, machine=self.machine, told=self.told.value,
+            state=Level.OK if self.told is Told.CLEARED else event.state, part=event.part, condition=event.condition,
+            text=event.text, cause=event.cause, advice=event.advice, start=event.start, since=event.since,
+            end=event.end, event=event.id,
+        )  # fmt: skip
+        rows = own.model_dump(mode="json").items()
+        return {name.rstrip("_"): value for name, value in rows if value not in (None, "")}
 
 
 class Outlet(Protocol):

@@ -24,9 +24,10 @@ Key = tuple[str, str, str, Language]
 
 @dataclass(frozen=True, slots=True)
 class PastPage:
-    """A report page, before and from its header."""
+    """A report page: before its header, from there to its first heading, and from there to its end."""
 
     head: bytes
+    top: bytes
     rest: bytes
     past: PastAnswers
 
@@ -83,5 +84,8 @@ class PastPages:
             self._asking, past_of, self._collector.ask, query, latest, (key[3], self._zone)
         )
         page = await loop.run_in_executor(self._making, received_page, past.history, query.since, now)
-        head, sign, rest = page.partition("<header>")
-        return PastPage(head.encode(errors="replace"), f"{sign}{rest}".encode(errors="replace"), past)
+        before, header, after = page.partition("<header>")
+        above, heading, below = after.partition("<h2>")  # texts from outside are escaped
+        pieces = before, f"{header}{above}", f"{heading}{below}"
+        head, top, rest = (piece.encode(errors="replace") for piece in pieces)
+        return PastPage(head, top, rest, past)
