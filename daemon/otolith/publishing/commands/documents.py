@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints
 
-from otolith.machine_file import check_name
-from otolith_drivers.config_files import DocumentModel
+from otolith_drivers.config_files import DocumentModel, check_name
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_USER = 60  # characters of the name of a person
