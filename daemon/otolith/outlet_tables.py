@@ -56,6 +56,7 @@ def _mail_address(text: str) -> str:
 
 
 Address = Annotated[str, AfterValidator(_address)]
+Name = Annotated[str, AfterValidator(check_name)]
 Topic = Annotated[str, AfterValidator(_topic)]
 MailAddress = Annotated[str, AfterValidator(_mail_address)]
 
@@ -74,16 +75,14 @@ class NoticeOptions(StrictModel):
     per_hour: PerHour = 60  # Notices at most
 
 
-class MqttOutlet(NoticeOptions, CredentialOptions):
-    """``[outlets.mqtt]``: JSON, and the discovery of Home Assistant."""
+class BrokerOptions(NoticeOptions, CredentialOptions):
+    """What outlets have that publish over MQTT."""
 
     host: Annotated[str, Field(min_length=1)]
     port: Port | None = None  # By default 1883, and 8883 with TLS
     tls: bool = False
     ca: Path | None = None  # By default the authorities of the computer
     client_id: str = ""  # By default a random one
-    prefix: Topic = "otolith"
-    discovery: Topic | None = "homeassistant"
 
     @property
     def place(self) -> str:
@@ -97,6 +96,20 @@ class MqttOutlet(NoticeOptions, CredentialOptions):
         if self.user is not None and not self.tls and not _is_loopback(self.host):
             raise ValueError("user belongs to tls = true: the password would be sent as it is")
         return self
+
+
+class MqttOutlet(BrokerOptions):
+    """``[outlets.mqtt]``: JSON, and the discovery of Home Assistant."""
+
+    prefix: Topic = "otolith"
+    discovery: Topic | None = "homeassistant"
+
+
+class SparkplugOutlet(BrokerOptions):
+    """``[outlets.sparkplug]``: a node of Sparkplug B, with a device for each machine."""
+
+    group: Name = "otolith"
+    node: Name | None = None  # By default "site", and of a daemon site and name of its machine
 
 
 class WebhookOutlet(NoticeOptions):
@@ -194,6 +207,7 @@ class OutletsTable(StrictModel):
     """``[outlets]``: each table is one outlet. ``/metrics`` for Prometheus is always there."""
 
     mqtt: MqttOutlet | None = None
+    sparkplug: SparkplugOutlet | None = None
     webhook: WebhookOutlet | None = None
     mail: MailOutlet | None = None
     opcua: OpcuaOutlet | None = None
@@ -214,7 +228,7 @@ class MachineOutletsTable(OutletsTable):
         """The computers that outlets connect to."""
         web = None if self.webhook is None else urlsplit(self.webhook.url).hostname
         hosts = [web] if web is not None else []
-        return (*hosts, *(own.host for own in (self.mqtt, self.mail) if own is not None))
+        return (*hosts, *(own.host for own in (self.mqtt, self.sparkplug, self.mail) if own is not None))
 
     @property
     def listening(self) -> tuple[str, ...]:

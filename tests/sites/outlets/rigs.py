@@ -17,6 +17,7 @@ from asyncua.sync import Client
 from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 from prometheus_client.parser import text_string_to_metric_families
+from tahutils.tahu.sparkplug_b_pb2 import Payload
 
 from tests.conftest import free_port
 from tests.drivers.mqtt_broker import mqtt_broker
@@ -186,6 +187,60 @@ class MqttRig(Rig, name="mqtt"):
         return [(row["machine"], row["told"]) for row in own]
 
 
+class SparkplugRig(MqttRig, name="sparkplug"):
+    """A host that follows the node by the official schema; one that comes now asks for births."""
+
+    def decoded(self, received: list[mqtt.MQTTMessage]) -> list[tuple[str, str, Any]]:
+        """Kind, device and payload of each message of the node."""
+        found = []
+        for message in list(received):
+            parts = message.topic.split("/")
+            if parts[0] == "spBv1.0" and parts[2] != "NCMD":
+                found.append((parts[2], "/".join(parts[4:]), Payload.FromString(bytes(message.payload))))
+        return found
+
+    @property
+    def messages(self) -> list[tuple[str, str, Any]]:
+        """What came to the host that was there before all."""
+        return self.decoded(self._received)
+
+    def command(self, client: mqtt.Client, topic: str) -> None:
+        """Ask for births."""
+        asked = Payload(timestamp=1)
+        asked.metrics.add(name="Node Control/Rebirth", datatype=11, boolean_value=True)
+        client.publish(topic, asked.SerializeToString(), qos=1)
+
+    def states(self) -> dict[str, str]:
+        nodes = {message.topic.split("/")[3] for message in list(self._received) if "/NBIRTH/" in message.topic}
+        received: list[mqtt.MQTTMessage] = []
+        client, is_subscribed = self.subscriber(received)
+        wait_for(is_subscribed.is_set)
+        for node in nodes:
+            self.command(client, f"spBv1.0/otolith/NCMD/{node}")
+
+        def is_born() -> bool:
+            own = self.decoded(received)
+            counts = [metrics_of(born)["Machines"].int_value for kind, _, born in own if kind == "NBIRTH"]
+            return len(counts) >= len(nodes) and len([1 for kind, _, _ in own if kind == "DBIRTH"]) >= sum(counts)
+
+        wait_for(is_born)
+        client.disconnect()
+        client.loop_stop()
+        births = [(device, metrics_of(born)) for kind, device, born in self.decoded(received) if kind == "DBIRTH"]
+        return {device.rpartition(".")[2]: own["State"].string_value for device, own in births}
+
+    def events(self) -> list[tuple[str, str]]:
+        own = [metrics_of(data)["Event"] for kind, _, data in self.messages if kind == "NDATA"
+               if "Event" in metrics_of(data)]  # fmt: skip
+        rows = [json.loads(metric.string_value) for metric in own]
+        return [(row["machine"], row["told"]) for row in rows]
+
+
+def metrics_of(payload: Any) -> dict[str, Any]:
+    """The metrics of a payload by name."""
+    return {metric.name: metric for metric in payload.metrics}
+
+
 class OpcuaRig(Rig, name="opcua"):
     """A client that reads: events come to those who have subscribed them, which has a test of its own."""
 
@@ -260,4 +315,6 @@ def scraped(port: int) -> str:
         return str(answer.read().decode())
 
 
-RIGS: dict[str, type[Rig]] = {kind.name: kind for kind in (MqttRig, WebhookRig, MailRig, OpcuaRig, PrometheusRig)}
+RIGS: dict[str, type[Rig]] = {
+    kind.name: kind for kind in (MqttRig, SparkplugRig, WebhookRig, MailRig, OpcuaRig, PrometheusRig)
+}

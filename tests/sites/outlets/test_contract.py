@@ -235,9 +235,8 @@ def test_no_more_is_told_than_the_limit_allows_and_the_rest_is_counted(works: Wo
 
 @pytest.mark.parametrize("content", [None, b"", b"\nsecret\n", b" \t\n"])
 def test_a_secret_that_is_missing_or_empty_is_named(works: Works, rig: Rig, content: bytes | None) -> None:
-    tables = {"mqtt": ('user = "a"', "password_file"), "mail": ('user = "a"', "password_file"),
-              "webhook": ("", "secret_file"),
-              "opcua": ('user = "a"', "password_file")}  # fmt: skip
+    user = 'user = "a"', "password_file"
+    tables = {"webhook": ("", "secret_file"), **dict.fromkeys(("mqtt", "sparkplug", "mail", "opcua"), user)}
     if rig.name not in tables:
         return
     lines, key = tables[rig.name]

@@ -6,6 +6,7 @@ import ssl
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from typing import Any
@@ -17,7 +18,7 @@ from otolith import __version__
 from otolith.health.limits import Level
 from otolith.health.schema import Language, ParameterDocument
 from otolith.health.text import texts_in
-from otolith.outlet_tables import MqttOutlet
+from otolith.outlet_tables import BrokerOptions, MqttOutlet
 from otolith.site.hall import SHOWN
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
@@ -36,13 +37,59 @@ ONLINE, OFFLINE = "online", "offline"
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template of Home Assistant may have as they are
 
 
+@dataclass(frozen=True, slots=True)
+class BrokerAccess:
+    """By what a broker lets this client in."""
+
+    secret: str
+    tls: ssl.SSLContext | None
+
+
+def access_of(options: BrokerOptions, setup: OutletSetup) -> BrokerAccess:
+    """Return what is in the files of a table; raise ConfigurationError if one cannot be used."""
+    secret = password(None if options.password_file is None else setup.folder / options.password_file)
+    pair = (options.certificate, options.key)
+    return BrokerAccess(secret, tls_context(setup.folder, options.ca, pair) if options.tls else None)
+
+
+def client_of(options: BrokerOptions, access: BrokerAccess) -> mqtt.Client:
+    """Return a client, not connected."""
+    client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=options.client_id, reconnect_on_failure=False)
+    client.connect_timeout = CONNECT_TIMEOUT
+    if options.user is not None:
+        client.username_pw_set(options.user, access.secret)
+    if access.tls is not None:
+        client.tls_set_context(access.tls)
+    return client
+
+
+def connect(client: mqtt.Client, options: BrokerOptions) -> None:
+    """Connect a client; raise OutletError if the broker is not there or refuses it."""
+    answered, refusal = threading.Event(), list[str]()
+
+    def on_connect(_: mqtt.Client, __: Any, ___: Any, code: Any, ____: Any) -> None:
+        if code.is_failure:
+            refusal.append(str(code))
+        answered.set()
+
+    client.on_connect = on_connect
+    try:
+        client.connect(options.host, options.port or (8883 if options.tls else 1883), KEEPALIVE)
+        client.loop_start()
+    except (OSError, ValueError) as error:
+        raise OutletError(failure(error, options.host)) from error
+    if not answered.wait(ANSWER_TIMEOUT) or refusal:
+        client.disconnect()
+        client.loop_stop()
+        reason = f"refuses this client: {refusal[0]}" if refusal else "no answer: is a broker there, is tls right?"
+        raise OutletError(f"{options.host}: {reason}")
+
+
 class MqttPublisher:
     """Implements :class:`otolith.site.outlets.base.Outlet`. Each connection begins with all that is known."""
 
-    def __init__(
-        self, options: MqttOutlet, secret: str, tls: ssl.SSLContext | None, language: Language, sender: str
-    ) -> None:
-        self._options, self._secret, self._tls, self._language = options, secret, tls, language
+    def __init__(self, options: MqttOutlet, access: "BrokerAccess", language: Language, sender: str) -> None:
+        self._options, self._access, self._language = options, access, language
         self._sender = sender  # A machine of a daemon, or empty for a site
         self._availability = "/".join(filter(None, (options.prefix, sender, "status")))
         self._client: mqtt.Client | None = None
@@ -96,32 +143,10 @@ class MqttPublisher:
         if self._client is not None and self._client.is_connected():
             return self._client
         self.close()
-        options = self._options
-        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=options.client_id, reconnect_on_failure=False)
-        client.connect_timeout = CONNECT_TIMEOUT
+        client = client_of(self._options, self._access)
         client.will_set(self._availability, OFFLINE, qos=1, retain=True)
-        if options.user is not None:
-            client.username_pw_set(options.user, self._secret)
-        if self._tls is not None:
-            client.tls_set_context(self._tls)
-        answered, refusal = threading.Event(), list[str]()
-
-        def on_connect(_: mqtt.Client, __: Any, ___: Any, code: Any, ____: Any) -> None:
-            if code.is_failure:
-                refusal.append(str(code))
-            answered.set()
-
-        client.on_connect = on_connect
-        try:
-            client.connect(options.host, options.port or (8883 if options.tls else 1883), KEEPALIVE)
-            client.loop_start()
-        except (OSError, ValueError) as error:
-            raise OutletError(failure(error, options.host)) from error
+        connect(client, self._options)
         self._client = client
-        if not answered.wait(ANSWER_TIMEOUT) or refusal:
-            self.close()
-            reason = f"refuses this client: {refusal[0]}" if refusal else "no answer: is a broker there, is tls right?"
-            raise OutletError(f"{options.host}: {reason}")
         client.publish(self._availability, ONLINE, qos=1, retain=True)
         return client
 
@@ -226,7 +251,4 @@ def _iso(seconds: float) -> str | None:
 
 def build(options: MqttOutlet, setup: OutletSetup) -> MqttPublisher:
     """Return the outlet; raise ConfigurationError if a file cannot be used."""
-    secret = password(None if options.password_file is None else setup.folder / options.password_file)
-    pair = (options.certificate, options.key)
-    tls = tls_context(setup.folder, options.ca, pair) if options.tls else None
-    return MqttPublisher(options, secret, tls, setup.language or "en", setup.sender)
+    return MqttPublisher(options, access_of(options, setup), setup.language or "en", setup.sender)

@@ -32,6 +32,7 @@ class OutletKind:
 
 OUTLETS = {
     "mqtt": OutletKind("otolith.site.outlets.mqtt", "paho", "mqtt"),
+    "sparkplug": OutletKind("otolith.site.outlets.sparkplug", "paho", "mqtt"),
     "webhook": OutletKind("otolith.site.outlets.webhook"),
     "mail": OutletKind("otolith.site.outlets.mail"),
     "opcua": OutletKind("otolith.site.outlets.opcua", "asyncua", "opcua"),
