@@ -12,7 +12,7 @@ from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling
 from otolith_drivers.conformance import CONTRACT, Rig, close_ends_everything_within_a_second
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import RIGS
-from tests.waiting import PATIENCE, within
+from tests.waiting import PATIENCE, wait_for, within
 
 
 @pytest.mark.timed
@@ -26,6 +26,37 @@ def test_driver_keeps_the_contract(
     with RIGS[name](own_machine) as rig:
         check(rig)
         rig.driver.close()
+
+
+@pytest.mark.timed
+@pytest.mark.parametrize("name", sorted(base.DRIVERS))
+def test_a_driver_of_the_package_answers_while_its_samples_are_being_taken(name: str, own_machine: OwnMachine) -> None:
+    """The guard asks it in the thread of the daemon, so an answer waits for no lock that is held meanwhile."""
+    taking, taken = threading.Event(), threading.Event()
+
+    def take(_: object) -> None:
+        taking.set()
+        taken.wait(PATIENCE)
+
+    with RIGS[name](own_machine) as rig:
+        rig.driver.open(take)
+
+        def is_taking() -> bool:
+            rig.emit()
+            return taking.wait(0.05)
+
+        wait_for(is_taking)
+        answers = list[object]()
+
+        def ask() -> None:
+            answers.extend((rig.driver.counters(), rig.driver.link()))
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        asking.join(PATIENCE)
+        taken.set()
+        rig.driver.close()
+        assert [type(answer) for answer in answers] == [Counters, Link]
 
 
 class StandIn:

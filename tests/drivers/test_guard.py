@@ -156,6 +156,25 @@ def test_so_it_is_if_it_is_the_only_source(case: str) -> None:
     source.close()
 
 
+def test_a_driver_of_the_package_says_in_the_thread_that_asks_how_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[threading.Thread]()
+
+    class Own(PlugIn):
+        def counters(self) -> Counters:
+            asked.append(threading.current_thread())
+            return Counters()
+
+        def link(self) -> Link:
+            asked.append(threading.current_thread())
+            raise ValueError("no state")
+
+    monkeypatch.setattr(Own, "__module__", "otolith_drivers.own")
+    source = GuardedSource("own", cast("Driver", Own()), ("x",), 0.01)
+    source.counters()
+    assert "link() raises ValueError: no state" in source.link().defect
+    assert set(asked) == {threading.current_thread()}
+
+
 def test_a_healthy_plug_in_is_no_event() -> None:
     with machine_with(PlugIn()) as (machine, _):
         link = use_all(machine)

@@ -20,6 +20,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.status import absent_sources
 from otolith.runtime.hall.machine import Task, WorkerResult
+from otolith.runtime.process import spare_collections
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,7 @@ def main(connection: Any, state: AdaptationState) -> None:
 
     with kernel_cache.observed(report):
         warm_up(state)
+        spare_collections()
         connection.send(Ready())
         while (task := connection.recv()) is not None:
             connection.send(answer(*task))

@@ -39,7 +39,7 @@ from otolith.runtime.hall.notifier import Notifier
 from otolith.runtime.hall.outlet_process import OutletProcess
 from otolith.runtime.hall.pool import Pool, Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
-from otolith.runtime.process import SIGNALS
+from otolith.runtime.process import SIGNALS, spare_collections
 from otolith.runtime.service import OUTLET_FLUSH, Service, SharedParts
 from otolith.storage.disk import StorageThread
 from otolith.storage.state_store import LockedError
@@ -116,6 +116,7 @@ class Daemon:
         self._pool.start(time.monotonic())
         if self._hall is not None:
             self._left_out.replace(self._hall.refused, {service.names for service in self._served}, time.time())
+        spare_collections()
         listening = text if self._is_alone else f"to {counted(len(self._services), 'machine')}"
         self._notifier.send("READY=1", f"STATUS=listening: {listening}", f"MAINPID={os.getpid()}")
 
@@ -261,6 +262,7 @@ class Daemon:
             if publisher.is_idle:
                 self._publishers.remove(publisher)
                 self._background.do(publisher.close)
+        spare_collections()
         if not self._is_alone:
             log.info("%d machines are served", len(self._services))
 
