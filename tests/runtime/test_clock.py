@@ -119,7 +119,8 @@ class Daemons:
             (window,) = windows(records()[self.window * RECORDS : (self.window + 1) * RECORDS], start)
             self.cut.append(replace(window, index=len(self.cut), ahead=service._clock.ahead))
             state, report = adapt(service.machine.state, self.cut[-1])
-            service.machine.state, service._unsaved = state, state
+            service.machine.state = state
+            service._unsaved = service.machine.packed
             service.machine.windows += 1
             service._publish(report, 0.1)
             self.window += 1

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.packed_state import PackedState
 from otolith.health.schema import Report
 from otolith.runtime.hall.machine import Machine, Task, WorkerResult
 from otolith.runtime.hall.pool import COMPILE_TIMEOUT, WINDOW_TIMEOUT, Pool
@@ -22,18 +22,18 @@ class Process:
 
     def __init__(self) -> None:
         self.alive, self.starts, self.processor_time = True, 1, 0.0
-        self.taken: list[tuple[AdaptationState, Task]] = []
+        self.taken: list[tuple[PackedState, Task]] = []
         self.sent: list[object] = [Ready()]
-        self.started: list[AdaptationState] = []
+        self.started: list[PackedState] = []
 
-    def start(self, state: AdaptationState) -> None:
+    def start(self, state: PackedState) -> None:
         self.alive, self.starts, self.sent = True, self.starts + 1, [Ready()]
         self.started.append(state)
 
     def may_restart(self, _: float) -> bool:
         return not self.alive
 
-    def offer(self, message: tuple[AdaptationState, Task]) -> bool:
+    def offer(self, message: tuple[PackedState, Task]) -> bool:
         self.taken.append(message)
         return True
 
@@ -121,7 +121,7 @@ def test_a_window_that_kills_its_workers_costs_that_window_of_that_machine(
     pool.submit(hostile, tasks[0], 0.0)
     pool.submit(well, tasks[0], 0.0)
     for _ in range(2):
-        next(process for process in (one, other) if process.taken[-1][0] is hostile.state).alive = False
+        next(process for process in (one, other) if process.taken[-1][0] is hostile.packed).alive = False
         pool.poll(1.0)
         pool.poll(1.0)  # the new worker is ready
     assert (hostile.missed, well.missed) == (1, 0)
@@ -187,7 +187,7 @@ def test_a_new_worker_warms_up_for_another_machine_if_the_one_before_died_of_it(
     for _ in range(2):
         worker.alive = False
         pool.poll(1.0)
-    assert {id(state) for state in worker.started} == {id(machine.state) for machine in machines}
+    assert {id(state) for state in worker.started} == {id(machine.packed) for machine in machines}
 
 
 def test_no_window_waits_for_a_worker_that_starts_while_another_one_is_ready(

@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import initial_state
 from otolith.cli.main import cli
 from otolith.health.schema import Report
@@ -104,7 +105,7 @@ def test_the_worker_tells_which_sources_and_outputs_failed(batch: list[Window]) 
     """As the daemon knew it at the end of the window; and it counts windows of bad quality."""
     drive = SourceState("drive", ("omega",), Link(up=False, reason="no answer"), Counters())
     link, raw = Link(up=True, sources=(drive,)), uncut(batch[0])
-    result = answer(state_for("R_a"), Task(raw, link, {"history": "disk full"}))
+    result = answer(PackedState.of(state_for("R_a")), Task(raw, link, {"history": "disk full"}))
     assert result.window is not None
     assert "no answer" in result.window.absent["drive"]
     assert result.window.outages == {"history": "disk full"}

@@ -25,6 +25,7 @@ from click.testing import CliRunner, Result
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, initial_state
 from otolith.cli.main import cli
 from otolith.health.diagnosis import FindingFeatures, MonitoringPlan, diagnose
@@ -64,6 +65,19 @@ def writer(folder: Path, max_bytes: int = BUDGET) -> EvidenceWriter:
     kept = EvidenceWriter(FILE)
     kept.folder, kept.max_bytes = folder, max_bytes
     return kept
+
+
+def add(kept: EvidenceWriter, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
+    """Keep a window with packed states, of which the same one is packed once, as it is in the daemon."""
+    kept.add(packed(before), window, report, packed(after))
+
+
+def packed(state: AdaptationState) -> PackedState:
+    known = PACKED.setdefault(id(state), (state, PackedState.of(state)))
+    return known[1]
+
+
+PACKED: dict[int, tuple[AdaptationState, PackedState]] = {}
 
 
 def fresh() -> AdaptationState:
@@ -160,7 +174,7 @@ def test_a_bundle_knows_which_inputs_have_no_sensor(batch: list[Window], folder:
     values = batch[0].values[:, [batch[0].signals.index(name) for name in machine.twin.signals]]
     window = Window.whole(0, START, PERIOD, machine.twin.signals, values)
     after, report = adapt(before, window)
-    kept.add(before, window, _raised(report), after)
+    add(kept, before, window, _raised(report), after)
     kept.write()
     (bundle,) = map(read_bundle, folder.glob("*.zip"))
     assert bundle.state.posterior.problem.twin == machine.twin
@@ -188,7 +202,7 @@ def test_evidence_after_a_restart_and_a_decision_is_reproduced(batch: list[Windo
     for window in batch[10:]:
         before = apply_decisions(state, decisions) if window.index == 12 else state
         state, report = adapt(before, window)
-        kept.add(before, window, report, state)
+        add(kept, before, window, report, state)
     kept.write()
     paths = sorted(folder.glob("*.zip"))
     items = read_bundle(paths[-1]).windows
@@ -204,9 +218,10 @@ def test_the_last_windows_are_kept(batch: list[Window], folder: Path, count: int
     kept, state = writer(folder), fresh()
     for index in range(count):
         after, report = replace(state, learned=index), _report() if index < count - 1 else _raised(_report())
-        kept.add(state, replace(batch[0], index=index), report, after)
+        add(kept, state, replace(batch[0], index=index), report, after)
         state = after
-    (bundle,) = kept._waiting
+    (wanted,) = kept._waiting
+    bundle = wanted.bundle({}, ())
     first = bundle.windows[0].window.index
     assert [item.window.index for item in bundle.windows] == list(range(first, count))
     assert min(count, 16) <= len(bundle.windows) <= 32
@@ -218,7 +233,7 @@ def test_large_windows_are_fewer(batch: list[Window], folder: Path, monkeypatch:
     monkeypatch.setattr(evidence, "MAX_WINDOW_BYTES", 3 * batch[0].values.nbytes)
     kept, state = writer(folder), fresh()
     for window in batch:
-        kept.add(state, window, _report(), state)
+        add(kept, state, window, _report(), state)
     assert len((*kept._older, *kept._newer)) <= 6
 
 
@@ -238,7 +253,7 @@ def fill(kept: EvidenceWriter, bundles: list[Path], count: int) -> None:
         before = after
     for number in range(count):
         for step in steps if number == 0 else steps[-1:]:
-            kept.add(*step)
+            add(kept, *step)
         kept.write()
 
 
@@ -274,11 +289,11 @@ def test_a_bundle_that_is_too_large_is_counted(
 ) -> None:
     state, kept = fresh(), writer(folder, 1000)
     report = _raised(_report())
-    kept.add(state, batch[0], report, state)
+    add(kept, state, batch[0], report, state)
     kept.write()
     assert "more than all may take" in caplog.text
     monkeypatch.setattr(evidence, "MAX_EVIDENCE_BYTES", 1000)
-    kept.add(state, batch[0], report, state)
+    add(kept, state, batch[0], report, state)
     kept.write()
     assert "more than 1000 bytes" in caplog.text
     assert (kept.dropped, list(folder.iterdir())) == (2, [])
@@ -310,7 +325,7 @@ def test_what_waits_for_the_disk_is_bounded(batch: list[Window], folder: Path) -
     kept, state = writer(folder), fresh()
     report = _raised(_report())
     for _ in range(MAX_WAITING_BUNDLES + 3):
-        kept.add(state, batch[0], report, state)
+        add(kept, state, batch[0], report, state)
     assert kept.dropped == 3
 
 

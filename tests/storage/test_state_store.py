@@ -11,6 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
@@ -59,7 +60,7 @@ def writer(store: StateStore) -> Iterator[StateWriter]:
 
 def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: StateWriter) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
-        writer.save(with_friction(amplitude))
+        writer.save(PackedState.of(with_friction(amplitude)))
     writer.stop(PATIENCE)
     assert store.components() == SAVED
 
@@ -85,7 +86,7 @@ def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> Non
     store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
     writer = StateWriter(store, store.operator.time())
     writer.start()
-    writer.save(STATE)
+    writer.save(PackedState.of(STATE))
     wait_for(store.components_path.exists)
     writer.stop(PATIENCE)
     assert writer.new_decisions() is None
@@ -106,7 +107,7 @@ def test_callers_do_not_wait_for_a_disk_that_hangs(
     monkeypatch.setattr(store, "decisions", hang)
     assert is_read.wait(PATIENCE)
     begun = time.monotonic()
-    writer.save(STATE)
+    writer.save(PackedState.of(STATE))
     assert writer.new_decisions() is None
     assert time.monotonic() - begun < IMMEDIATELY
     writer.stop(0.2)
@@ -143,7 +144,7 @@ def test_a_failed_write_is_tried_again_and_logged_once(
 ) -> None:
     folder = store.components_path.parent
     folder.write_text("a file where a folder should be", encoding="utf-8")
-    writer.save(STATE)
+    writer.save(PackedState.of(STATE))
     wait_for(lambda: "what was learned is not saved" in caplog.text)
     folder.unlink()
     writer.stop(PATIENCE)
@@ -159,7 +160,7 @@ def test_no_error_ends_the_thread_and_decisions_are_read_after_it(
 
     with monkeypatch.context() as patch:
         patch.setattr(store, "save", fail)
-        writer.save(STATE)
+        writer.save(PackedState.of(STATE))
         wait_for(lambda: "what was learned is not saved: MemoryError" in caplog.text)
         store.operator.write(OperatorDecisions(approved=frozenset({FRICTION.key})))
         wait_for(lambda: writer.new_decisions() is not None)
@@ -181,7 +182,7 @@ def test_a_state_directory_that_can_be_used_later_is_used_then(
     writer = StateWriter(store, 0.0)
     writer.fail(raised.value)
     writer.start()
-    writer.save(with_friction(-0.002))
+    writer.save(PackedState.of(with_friction(-0.002)))
     wait_for(lambda: str(folder) in writer.outage)
     folder.unlink()
     (tmp_path / "away").rename(folder)
@@ -206,7 +207,7 @@ def test_another_process_that_came_first_ends_who_waited_for_the_directory(tmp_p
     other = StateStore("here", "motor", PROBLEM.base_model, folder)
     other.lock()
     writer = StateWriter(store, 0.0)
-    writer.save(with_friction(-0.002))
+    writer.save(PackedState.of(with_friction(-0.002)))
     writer.write()
     assert writer.locked_out is not None
     assert not other.components_path.exists()
@@ -254,7 +255,7 @@ def test_who_finds_another_process_in_the_place_of_its_lock_writes_nothing(store
     with other_store(store).locked():
         writer = StateWriter(store, store.operator.time())
         writer.start()
-        writer.save(STATE)
+        writer.save(PackedState.of(STATE))
         wait_for(lambda: writer.locked_out is not None)
         writer.stop(PATIENCE)
         assert f"process {os.getpid()} of Otolith already uses" in str(writer.locked_out)

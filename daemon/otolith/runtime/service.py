@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from otolith import __version__
+from otolith.adaptation.packed_state import PackedState, keys_of
 from otolith.adaptation.state import (
     AdaptationState,
     OperatorDecisions,
     apply_decisions,
     with_problem,
 )
-from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.events import missed_notes
 from otolith.health.labels import Numbers, baseline_event, clock_event, expiry_event
 from otolith.health.schema import CountersDocument, DaemonDocument, EventDocument, Language, Report, ReportDocument
@@ -188,8 +188,8 @@ class Service:
         self._waiting: tuple[str, ...] = ()  # Parameters whose baselines were found with other values
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
-        self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
-        self._described: MonitoringPlan | None = None  # by the history
+        self._unsaved: PackedState | None = None  # the last state that no window contradicts
+        self._described = b""  # Plan that the history has
         self._recorder = RecorderSupervisor(machine, recording, None if shared is None else shared.recorder)
         self._outlets = OutletProcess() if shared is None else shared.outlets
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
@@ -346,7 +346,7 @@ class Service:
             notes.append(f"started without the operator's decisions: {error}")
         for text in notes:
             log.warning("%s", text)
-        self._notes, self._saved = tuple(notes), _keys(state)
+        self._notes, self._saved = tuple(notes), keys_of(state)
         if math.isfinite(end := state.posterior.belief.end):
             log.info(
                 "started with what was learned up to %s",
@@ -498,11 +498,11 @@ class Service:
 
     def _describe(self) -> None:
         """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
-        plan = self.machine.state.plan
-        if self._history is not None and plan != self._described:
-            machine = self._loaded
-            text = describe_machine(machine.twin, plan, None, machine.path, dict(machine.problem.known))
-            self._history.description, self._described = text, plan
+        packed, machine = self.machine.packed, self._loaded
+        if self._history is not None and packed.plan != self._described:
+            plan, known = packed.unpack_plan(), dict(machine.problem.known)
+            self._history.description = describe_machine(machine.twin, plan, None, machine.path, known)
+            self._described = packed.plan
 
     def _counters(self, restarts: int) -> CountersDocument:
         rings, driver = self.machine.rings.counters(), self._loaded.driver.counters()
@@ -554,17 +554,11 @@ class Service:
 
         A state that windows contradict is not saved: it might not be restored as what it was. The one before it is.
         """
-        if self.machine.finished and self.machine.state.is_valid:
-            self._unsaved = self.machine.state
+        if self.machine.finished and self.machine.packed.is_valid:
+            self._unsaved = self.machine.packed
         if self._unsaved is None:
             return
-        keys = _keys(self._unsaved)
+        keys = self._unsaved.keys
         if keys != self._saved or now - self._saved_at >= SAVE_INTERVAL:
             self._writer.save(self._unsaved)
             self._saved, self._saved_at, self._unsaved = keys, now, None
-
-
-def _keys(state: AdaptationState) -> tuple[str, ...]:
-    """Return what is saved at once when it changes: components, open events with their states, notes of persons."""
-    events = (f"{event.id} {event.state}" for event in state.health.open_events)
-    return (*(known.component.key for known in state.adopted), *events, *state.health.taken, *state.health.shelves)

@@ -10,14 +10,16 @@ adaptation core with its compiler and optimiser, and SciPy, which bridges inputs
 import contextlib
 import logging
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from otolith import kernel_cache
 from otolith.acquisition.window import Window
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import AdaptationState, with_problem
+from otolith.health.schema import Report
 from otolith.health.status import absent_sources
 from otolith.runtime.hall.machine import Task, WorkerResult
 from otolith.runtime.process import spare_collections
@@ -29,11 +31,22 @@ WARM_UP_RECORDS = 40  # of the random window that makes a new worker compile eve
 WARM_UP_KERNELS = 11  # that a new worker compiles or loads
 
 
+@dataclass(frozen=True, slots=True)
+class Performed:
+    """A window with its report and the next state; after a failure the unchanged state and no report."""
+
+    window: Window | None  # None if it could not be cut
+    state: AdaptationState
+    report: Report | None
+    seconds: float  # Computing time, s
+    failure: str  # The exception, or an empty string
+
+
 class Ready(NamedTuple):
     """The worker has started: sent once, before the first result."""
 
 
-def main(connection: Any, state: AdaptationState) -> None:
+def main(connection: Any, packed: PackedState) -> None:
     """Serve in the worker process: receive (state, task) and send a result, until None comes.
 
     Each step of a kernel is sent as well, and :class:`Ready` once.
@@ -47,7 +60,7 @@ def main(connection: Any, state: AdaptationState) -> None:
             connection.send(step)
 
     with kernel_cache.observed(report):
-        warm_up(state)
+        warm_up(packed.unpack())
         spare_collections()
         connection.send(Ready())
         while (task := connection.recv()) is not None:
@@ -57,7 +70,15 @@ def main(connection: Any, state: AdaptationState) -> None:
                 has_compiled = False
 
 
-def answer(state: AdaptationState, task: Task) -> WorkerResult:
+def answer(packed: PackedState, task: Task) -> WorkerResult:
+    """Cut the window of a task and adapt to it; the next state has a plan only if it is another one."""
+    performed = _performed(packed.unpack(), task)
+    after = packed if performed.report is None else PackedState.of(performed.state, packed)
+    after = after.without_plan() if after.plan is packed.plan else after
+    return WorkerResult(task.index, performed.window, after, performed.report, performed.seconds, performed.failure)
+
+
+def _performed(state: AdaptationState, task: Task) -> Performed:
     """Cut the window of a task and adapt to it; samples that cannot be cut cost this window only."""
     from otolith.acquisition.cutting import cut  # noqa: PLC0415 - see the module's docstring
 
@@ -66,11 +87,11 @@ def answer(state: AdaptationState, task: Task) -> WorkerResult:
         absent = absent_sources(task.link, window, {output.name for output in state.problem.twin.outputs})
     except Exception as error:
         log.exception("window %d", task.index)
-        return WorkerResult(task.index, None, state, None, 0.0, f"{type(error).__name__}: {error}")
+        return Performed(None, state, None, 0.0, f"{type(error).__name__}: {error}")
     return perform(state, replace(window, absent=absent, outages=task.outages))
 
 
-def perform(state: AdaptationState, window: Window) -> WorkerResult:
+def perform(state: AdaptationState, window: Window) -> Performed:
     """Adapt to a window; an exception costs this window only."""
     from otolith.adaptation.adapt import adapt  # noqa: PLC0415 - see the module's docstring
 
@@ -81,7 +102,7 @@ def perform(state: AdaptationState, window: Window) -> WorkerResult:
     except Exception as error:  # any fault of the core: reported with the window, and the state stays as it was
         log.exception("window %d", window.index)
         failure = f"{type(error).__name__}: {error}"
-    return WorkerResult(window.index, window, state, report, time.perf_counter() - begun, failure)
+    return Performed(window, state, report, time.perf_counter() - begun, failure)
 
 
 def warm_up(state: AdaptationState) -> str:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from otolith.acquisition.window import Window
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import AdaptationState
 from otolith.health.events import OF_DATA
 from otolith.health.schema import EventChange, EventDocument, Report
@@ -193,6 +194,31 @@ def stamp_of(end: float) -> str:
     return datetime.fromtimestamp(end, UTC).strftime(STAMP)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _KeptWindow:
+    """A window that may become evidence, with the report of it."""
+
+    state: PackedState | None  # As in EvidenceWindow
+    window: Window
+    report: str
+
+    def evidence(self) -> EvidenceWindow:
+        return EvidenceWindow(None if self.state is None else self.state.unpack(), self.window, self.report)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Wanted:
+    """What a bundle is made of that was asked for: :meth:`EvidenceWriter.write` makes it."""
+
+    events: tuple[EventDocument, ...]
+    state: PackedState
+    windows: tuple[_KeptWindow, ...]
+
+    def bundle(self, of: Mapping[str, str], unmeasured: tuple[UnmeasuredInput, ...]) -> Bundle:
+        windows = tuple(each.evidence() for each in self.windows)
+        return Bundle(VERSION, of, unmeasured, self.events, self.state.unpack(), windows)
+
+
 class EvidenceWriter(WriterThread):
     """The bundles of one machine while its daemon runs; the oldest are deleted for new ones."""
 
@@ -204,13 +230,13 @@ class EvidenceWriter(WriterThread):
         self.dropped = 0  # changes of events without a bundle
         self._unmeasured = machine.unmeasured
         self._key, self._versions = f"{machine.file.machine.site}.{machine.file.machine.name}", versions()
-        self._older: tuple[EvidenceWindow, ...] = ()
-        self._newer: tuple[EvidenceWindow, ...] = ()
-        self._states: tuple[AdaptationState, ...] = ()  # before the first of the older and of the newer windows
-        self._after: AdaptationState | None = None
-        self._waiting: deque[Bundle] = deque()
+        self._older: tuple[_KeptWindow, ...] = ()
+        self._newer: tuple[_KeptWindow, ...] = ()
+        self._states: tuple[PackedState, ...] = ()  # before the first of the older and of the newer windows
+        self._after: PackedState | None = None
+        self._waiting: deque[_Wanted] = deque()
 
-    def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
+    def add(self, before: PackedState, window: Window, report: Report, after: PackedState) -> None:
         """Keep the last finished windows with reports and states; request a bundle if this one changed an event."""
         if not self.max_bytes:
             return
@@ -218,24 +244,22 @@ class EvidenceWriter(WriterThread):
         if not self._states or len(self._newer) >= MIN_WINDOWS or size >= MAX_WINDOW_BYTES:
             self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
         state = None if before is self._after else before
-        self._newer, self._after = (*self._newer, EvidenceWindow(state, window, report.document.to_json())), after
+        self._newer, self._after = (*self._newer, _KeptWindow(state, window, report.document.to_json())), after
         if events := tuple(filter(has_evidence, announcements(report.document))):
             is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
             self.dropped += is_full
-            bundle = Bundle(
-                VERSION, self._versions, self._unmeasured, events, self._states[0], (*self._older, *self._newer)
-            )
-            self._waiting += [] if is_full else [bundle]
+            wanted = _Wanted(events, self._states[0], (*self._older, *self._newer))
+            self._waiting += [] if is_full else [wanted]
             self.wake()
 
     def write(self) -> None:
         """Write the bundles that wait."""
         while self._waiting:
-            bundle = self._waiting[0]
-            names = ", ".join(event.id for event in bundle.events)
+            wanted = self._waiting[0]
+            names = ", ".join(event.id for event in wanted.events)
             try:
-                data = pack(bundle, self.files)
-                path = self._path(bundle.windows[-1].window.end, len(data))
+                data = pack(wanted.bundle(self._versions, self._unmeasured), self.files)
+                path = self._path(wanted.windows[-1].window.end, len(data))
             except (TypeError, ValueError) as error:
                 self.dropped += 1
                 log.warning("%s: no evidence of %s: %s", self.folder, names, error)

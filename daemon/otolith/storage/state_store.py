@@ -20,6 +20,7 @@ from otolith.adaptation.fingerprints import (
     twin_fingerprint,
     values_fingerprint,
 )
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import (
     AdaptationState,
     ComponentRecord,
@@ -367,13 +368,13 @@ class StateWriter(WriterThread):
         """``decisions_time`` is the :meth:`DecisionsFile.time` of the decisions that are known already."""
         super().__init__("writer", DECISIONS_INTERVAL, "what was learned is not saved")
         self._store, self._decisions_time = store, decisions_time
-        self._to_save: deque[AdaptationState] = deque(maxlen=1)
-        self._unsaved: AdaptationState | None = None
+        self._to_save: deque[PackedState] = deque(maxlen=1)
+        self._unsaved: PackedState | None = None
         self._new_decisions: deque[OperatorDecisions] = deque(maxlen=1)
         self.locked_out: LockedError | None = None
         """Another process has taken the lock that this one had: its file was removed."""
 
-    def save(self, state: AdaptationState) -> None:
+    def save(self, state: PackedState) -> None:
         """Request that ``state`` replaces what is on disk."""
         self._to_save.append(state)
         self.wake()
@@ -392,7 +393,7 @@ class StateWriter(WriterThread):
         if self._to_save:
             self._unsaved = self._to_save.popleft()
         if self._unsaved is not None:
-            self._store.save(self._unsaved)
+            self._store.save(self._unsaved.unpack())
             self._unsaved = None
 
     def read(self) -> None:

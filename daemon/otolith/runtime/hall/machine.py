@@ -14,6 +14,7 @@ from typing import Self
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict, Window
 from otolith.acquisition.windower import RawWindow, Windower
+from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import AdaptationState, initial_state, with_sample_grid
 from otolith.estimation.problem import WindowOptions
 from otolith.health.labels import Numbers
@@ -53,7 +54,7 @@ class WorkerResult:
 
     window_index: int
     window: Window | None  # None if it could not be cut
-    state: AdaptationState
+    state: PackedState  # Without its plan if that is the one of the state before
     report: Report | None
     seconds: float  # Computing time, s
     failure: str  # The exception, or an empty string
@@ -63,10 +64,10 @@ class WorkerResult:
 class FinishedWindow:
     """A window that was computed, with the states before and after it."""
 
-    before: AdaptationState
+    before: PackedState
     window: Window
     report: Report
-    after: AdaptationState
+    after: PackedState
     seconds: float  # Computing time, s
 
 
@@ -76,7 +77,7 @@ class Machine:
     def __init__(self, state: AdaptationState, rings: Rings, windower: Windower, longest: float) -> None:
         """``longest`` is the length of its longest window, s."""
         self.rings, self.windower, self.longest = rings, windower, longest
-        self.state = state
+        self.packed = PackedState.of(state)
         """State after the last finished window."""
         self.numbers = Numbers(0.0)
         self.windows = 0  # That were due
@@ -107,6 +108,15 @@ class Machine:
         )
 
     @property
+    def state(self) -> AdaptationState:
+        """State after the last finished window."""
+        return self.packed.unpack()
+
+    @state.setter
+    def state(self, state: AdaptationState) -> None:
+        self.packed = PackedState.of(state, self.packed)
+
+    @property
     def is_waiting(self) -> bool:
         """Whether a window waits for a worker, and none is computed."""
         return self.current is None and bool(self._waiting)
@@ -114,7 +124,7 @@ class Machine:
     def begin(self, now: float) -> None:
         """Expect samples from ``now`` on."""
         self._started_at = now
-        self.windower.records = self.state.records
+        self.windower.records = self.packed.records
 
     def due_at(self, now: float) -> float:
         """Return when to ask for the next window: ``now`` if it is complete, or waits no longer for late samples."""
@@ -140,11 +150,12 @@ class Machine:
         while len(self._waiting) > MAX_WAITING_WINDOWS:
             self._miss(self._waiting.popleft(), behind)
 
-    def dispatch(self) -> tuple[AdaptationState, Task]:
+    def dispatch(self) -> tuple[PackedState, Task]:
         """Return the window that waits for the longest time, and the state for it: a worker computes it now."""
-        self.state, self._changes = self.next_state(), []
+        if self._changes:
+            self.state, self._changes = self.next_state(), []
         self.current = self._waiting.popleft()
-        return self.state, self.current
+        return self.packed, self.current
 
     def accept(self, result: WorkerResult) -> FinishedWindow | None:
         """Go on with the result of a worker; None if it is that of a window which failed or was put back."""
@@ -157,10 +168,10 @@ class Machine:
         if result.report is None or result.window is None:
             self._miss(task, result.failure)
             return None
-        before, self.state = self.state, result.state
+        before, self.packed = self.packed, result.state.with_plan_of(self.packed)
         self.finished += 1
-        self.windower.records = self.next_state().records
-        return FinishedWindow(before, result.window, result.report, result.state, result.seconds)
+        self.windower.records = self.next_state().records if self._changes else self.packed.records
+        return FinishedWindow(before, result.window, result.report, self.packed, result.seconds)
 
     def put_back(self) -> None:
         """Let the window of a worker that died wait again, once; then it is missed."""

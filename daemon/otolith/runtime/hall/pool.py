@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from otolith import kernel_cache
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.packed_state import PackedState
 from otolith.runtime.effort import Effort
 from otolith.runtime.hall.machine import NOT_READY, FinishedWindow, Machine, Task, WorkerResult
 from otolith.runtime.process import ChildProcess
@@ -65,7 +65,7 @@ class Worker:
         """Whether it can take a window."""
         return self.machine is None and self.process.alive
 
-    def start(self, state: AdaptationState) -> None:
+    def start(self, state: PackedState) -> None:
         """Start the process, which compiles or loads the kernels of ``state``."""
         self.is_compiling, self.is_ready, self.prepared = True, False, []
         self.process.start(state)
@@ -238,7 +238,7 @@ class Pool:
     def _start(self, worker: Worker) -> None:
         """Start a worker; if the twin of a machine kills it meanwhile, the next one begins with another machine."""
         number = worker.process.starts + self.workers.index(worker)
-        worker.start(self._machines[number % len(self._machines)].state)
+        worker.start(self._machines[number % len(self._machines)].packed)
 
     def _dispatch(self, now: float) -> None:
         """Give windows to workers; while one is ready, none waits for one that starts and may compile for minutes."""
