@@ -238,3 +238,23 @@ def test_the_grace_period_covers_the_next_sample_of_a_slow_input(interval: float
         cut_next(windower, rings)
     expected = min(max(1.5 * interval, GRACE_PERIOD), RECORDS * PERIOD)
     assert windower.grace == pytest.approx(expected if interval < 3.0 * RECORDS * PERIOD else GRACE_PERIOD)
+
+
+@pytest.mark.parametrize("capacity", [3, 300, 5000])
+def test_samples_of_a_ring_are_the_same_one_by_one_and_at_once(capacity: int) -> None:
+    """Also if some are older than others, and if the ring is read meanwhile."""
+    random = np.random.default_rng(0)
+    times = np.arange(1000) * 0.01 + random.choice([0.0, -0.03], 1000, p=[0.99, 0.01])
+    values = random.standard_normal(1000)
+    one, all_at_once = Rings(("a",), capacity), Rings(("a",), capacity)
+    for first in range(0, 1000, 70):
+        part = slice(first, first + 70)
+        one.deliver([Sample("a", *row) for row in zip(times[part].tolist(), values[part].tolist(), strict=True)])
+        all_at_once.deliver_columns({"a": (times[part], values[part])})
+        assert one.last_times() == all_at_once.last_times()
+        if first % 4 == 0:
+            read = [rings.around("a", times[first] - 1.0, times[first], times[first]) for rings in (one, all_at_once)]
+            assert all(np.array_equal(*pair) for pair in zip(*read, strict=True))
+    assert one.counters() == all_at_once.counters()
+    everything = [rings.around("a", -1.0, 20.0, 0.0) for rings in (one, all_at_once)]
+    assert all(np.array_equal(*pair) for pair in zip(*everything, strict=True))

@@ -12,6 +12,7 @@ from otolith_drivers.base import Sample
 
 # Threshold: docs/reference/thresholds-acquisition.md has its origin.
 MAX_OBSERVED_AGE = 600.0  # s after which the last value of an observed signal is no longer used
+GATHERED = 256  # samples of a signal that are put into its ring together
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,20 @@ class Ring:
         self._read_up_to = -math.inf
         self._newest = -math.inf
         self._unordered_until = 0  # count up to which a sample may be older than one that came before it
-        self.overwritten = 0
+        self._overwritten = 0
+        self._new_times: list[float] = []  # Of the newest samples, which are not yet in the arrays
+        self._new_values: list[float] = []
+
+    @property
+    def overwritten(self) -> int:
+        """Samples that were overwritten before a window had read them."""
+        self._gather()
+        return self._overwritten
 
     @property
     def state(self) -> RingState:
         """All of the ring, with copies of its samples."""
+        self._gather()
         held = min(self._count, len(self._times))
         return RingState(
             len(self._times),
@@ -70,7 +80,7 @@ class Ring:
             self._read_up_to,
             self._newest,
             self._unordered_until,
-            self.overwritten,
+            self._overwritten,
         )
 
     @classmethod
@@ -80,30 +90,35 @@ class Ring:
         held = len(state.times)
         ring._times[:held], ring._values[:held] = state.times, state.values
         ring._count, ring._read_up_to, ring._newest = state.count, state.read_up_to, state.newest
-        ring._unordered_until, ring.overwritten = state.unordered_until, state.overwritten
+        ring._unordered_until, ring._overwritten = state.unordered_until, state.overwritten
         return ring
 
     def append(self, time: float, value: float) -> None:
         """Add a sample: ``time`` in s, ``value`` NaN where the source had no reading."""
-        slot = self._count % len(self._times)
-        if self._count >= len(self._times) and self._times[slot] >= self._read_up_to:
-            self.overwritten += 1
-        self._times[slot] = time
-        self._values[slot] = value
-        self._count += 1
-        if time < self._newest:
-            self._unordered_until = self._count
-        else:
-            self._newest = time
+        self._new_times.append(time)
+        self._new_values.append(value)
+        if len(self._new_times) >= GATHERED:
+            self._gather()
 
     def extend(self, times: Array, values: Array) -> None:
         """Add many samples (s, value) at once, with the same result as :meth:`append` for each."""
+        self._gather()
+        self._extend(times, values)
+
+    def _gather(self) -> None:
+        """Put the newest samples into the arrays: of many at once it takes much less time."""
+        if self._new_times:
+            times, values = np.array(self._new_times), np.array(self._new_values)
+            self._new_times, self._new_values = [], []
+            self._extend(times, values)
+
+    def _extend(self, times: Array, values: Array) -> None:
         capacity = len(self._times)
         for first in range(0, len(times), capacity):
             part = slice(first, first + capacity)
             slots = np.arange(self._count, self._count + len(times[part]))
             reused = slots[slots >= capacity] % capacity
-            self.overwritten += int(np.count_nonzero(self._times[reused] >= self._read_up_to))
+            self._overwritten += int(np.count_nonzero(self._times[reused] >= self._read_up_to))
             self._times[slots % capacity] = times[part]
             self._values[slots % capacity] = values[part]
             self._count += len(slots)
@@ -116,6 +131,7 @@ class Ring:
 
         Samples before ``read_until`` (s) are marked as read: if they are overwritten, they are not lost.
         """
+        self._gather()
         times, values = self._ordered()
         first, last = (int(index) for index in np.searchsorted(times, (start, end)))
         before = np.flatnonzero(np.isfinite(values[:first]))
@@ -139,10 +155,13 @@ class Ring:
 
     def first_time(self) -> float:
         """Return the time of the oldest sample still held, s; infinity if there is none."""
+        self._gather()
         return float(self._times[: min(self._count, len(self._times))].min(initial=math.inf))
 
     def last_time(self) -> float:
         """Return the time of the newest sample, s; minus infinity if there is none."""
+        if self._new_times:
+            return self._new_times[-1]
         return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
 
 

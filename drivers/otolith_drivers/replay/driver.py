@@ -28,8 +28,9 @@ from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds
 
 # Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
 CHUNK_POLL = 0.005  # s between two looks whether a chunk is read
-GATHERED = 0.02  # s between two deliveries at least: their rows have their own times, and a wake-up costs more than one
+GATHERED = 0.05  # s between two deliveries at least: their rows have their own times, and a wake-up costs more than one
 MAX_WAIT = 10.0  # s; the times of rows are taken from the clock at least so often
+ROWS_MADE_AT_ONCE = 100  # whose samples are made together
 MAX_ROWS_AT_ONCE = 500  # delivered together; bounds how long one call of deliver() takes
 SILENCE_WARNING = 60.0  # s without a row in the file, after which the link warns
 
@@ -191,13 +192,13 @@ class ReplayDriver:
     def _deliver(self, rows: Rows, times: Array, deliver: Deliver) -> Playing:
         """Deliver each row at its time; a row that goes back in time comes with the row above it."""
         clock = np.maximum.accumulate(np.maximum(times, self._clock))
-        at = 0
+        at, ready = 0, SamplesOfRows(rows, times)
         while at < len(clock) and not self._stop.is_set():
             now, until = time.monotonic(), min(at + MAX_ROWS_AT_ONCE, len(clock))
             if self._paced:
                 until = min(until, int(np.searchsorted(clock, now, side="right")))
             if until > at:
-                samples = _samples(rows, times, slice(at, until))
+                samples = ready.take(at, until)
                 self._received += len(samples)
                 self._bad = self._bad_before + int(rows.bad[until - 1])
                 deliver(samples)
@@ -216,12 +217,33 @@ def _result(asked: "Future[Read]") -> Generator[float, None, Read]:
     return asked.result()
 
 
-def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
-    """The readings of some rows, in the order of the rows."""
-    numbered = []
-    for name, values in rows.columns.items():
-        present = np.flatnonzero(np.isfinite(values[part]))
-        readings = zip(present.tolist(), times[part][present].tolist(), values[part][present].tolist(), strict=True)
-        numbered += [(row, Sample(name, moment, value)) for row, moment, value in readings]
-    numbered.sort(key=lambda pair: pair[0])
-    return [sample for _, sample in numbered]
+class SamplesOfRows:
+    """The samples of a chunk in the order of its rows, made for many rows at once: they are taken a few at a time."""
+
+    def __init__(self, rows: Rows, times: Array) -> None:
+        """``times`` (rows,) are monotonic, s."""
+        self._rows, self._times = rows, times
+        self._begin = self._end = 0  # Rows of which the samples are made
+        self._made: list[Sample] = []
+        self._before = [0]  # Samples before each of those rows, and after the last one
+
+    def take(self, first: int, last: int) -> list[Sample]:
+        """Return the samples of the rows from ``first`` until ``last``, none of which is before those taken last."""
+        taken: list[Sample] = []
+        while first < last:
+            if first >= self._end:
+                self._make(first, min(max(first + ROWS_MADE_AT_ONCE, last), len(self._times)))
+            end = min(last, self._end)
+            taken += self._made[self._before[first - self._begin] : self._before[end - self._begin]]
+            first = end
+        return taken
+
+    def _make(self, first: int, last: int) -> None:
+        part, names = slice(first, last), list(self._rows.columns)
+        values = np.column_stack([self._rows.columns[name][part] for name in names])
+        present = np.isfinite(values)
+        at, column = np.nonzero(present)
+        named = map(names.__getitem__, column.tolist())
+        self._made = list(map(Sample, named, self._times[part][at].tolist(), values[present].tolist()))
+        self._before = [0, *np.cumsum(present.sum(axis=1)).tolist()]
+        self._begin, self._end = first, last

@@ -12,7 +12,7 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
+from otolith_drivers.replay.driver import Options, ReplayDriver, SamplesOfRows, Source, build
 from otolith_drivers.replay.readers import Rows
 from otolith_drivers.replay.table import reader as table
 from tests.conftest import EXAMPLES, SIGNALS
@@ -204,3 +204,17 @@ def test_a_receiver_that_raises_ends_no_other_recording(tmp_path: Path) -> None:
     assert right.link().reason == ENDED
     assert len(got) == 118
     assert "full" in wrong.link().reason
+
+
+@pytest.mark.parametrize("step", [1, 7, 90, 250])
+def test_rows_have_the_same_samples_however_many_are_taken(step: int) -> None:
+    random = np.random.default_rng(0)
+    columns = {name: np.where(random.random(250) < 0.3, np.nan, random.random(250)) for name in "ab"}
+    times, numbers = np.arange(250) * 0.01, np.zeros(250, dtype=np.int64)
+    ready = SamplesOfRows(Rows(times, columns, numbers, numbers), times)
+    taken = [sample for first in range(0, 250, step) for sample in ready.take(first, min(first + step, 250))]
+    rows = range(250)
+    assert taken == [
+        Sample(name, times[row], columns[name][row]) for row in rows for name in "ab" if np.isfinite(columns[name][row])
+    ]
+    assert {type(sample.time) for sample in taken} == {float}
