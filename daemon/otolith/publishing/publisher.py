@@ -9,7 +9,7 @@ import contextlib
 import logging
 import math
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
@@ -138,7 +138,7 @@ class Publisher:
         self._refused = ""  # Why files that were replaced cannot be used
         self._unusable: tuple[object, ...] = ()  # Stamps of the files at the latest look that could not use them
         self._sessions: tuple[_Session, ...] = ()
-        self._answers = QueryAnswers()
+        self._answers, self._latest = QueryAnswers(), QueryAnswers("answer-latest", share=1.0)
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
         self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
         everything = _Endpoints(self._listen, tuple(access.zenoh.connect))
@@ -262,6 +262,7 @@ class Publisher:
         self._wake.set()
         self._thread.join(CLOSE_WAIT)
         self._answers.close()
+        self._latest.close()
         with self._lock:
             sessions, self._sessions = self._sessions, ()
         for each in sessions:
@@ -379,26 +380,7 @@ class Publisher:
         return replace(access, zenoh=own).settings(prefixes, endpoints.listen)
 
     def _declare(self, within: _Session, own: Published) -> None:
-        """Declare in a session that a machine is alive, what answers queries about it, and its reports.
-
-        Zenoh starts a thread for each queryable, which is a daemon thread if that which declares is one: it would abort
-        the interpreter at its end.
-        """
-        failed = list[Exception]()
-
-        def declare() -> None:
-            try:
-                self._declare_here(within, own)
-            except Exception as error:  # noqa: BLE001 - raised again in the thread that waits for this one
-                failed.append(error)
-
-        thread = threading.Thread(target=declare, name="declare", daemon=False)
-        thread.start()
-        thread.join()
-        for error in failed:
-            raise error
-
-    def _declare_here(self, within: _Session, own: Published) -> None:
+        """Declare in a session that a machine is alive, what answers queries about it, and its reports."""
         name = own.site, own.machine
         report = within.opened.declare_publisher(
             REPORT.under(*name),
@@ -415,17 +397,19 @@ class Publisher:
         def reply(query: zenoh.Query, topic: Topic, kind: str) -> None:
             with self._lock:
                 latest = {REPORT: own.latest, START: own.start}.get(topic)
+            answer(query, keys[topic], kind, latest, None)
+
+        def take(query: zenoh.Query, topic: Topic, kind: str) -> None:
             if topic is not START and asks_for_past(query):
                 self._answers.add(query, partial(answer, key=keys[topic], kind=kind, latest=None, archive=own.archive))
-                return
-            with query:
-                answer(query, keys[topic], kind, latest, None)
+            else:
+                self._latest.add(query, partial(reply, topic=topic, kind=kind))
 
         return (
             *self._commanded(opened, own),
-            opened.declare_queryable(keys[REPORT], partial(reply, topic=REPORT, kind="report"), complete=True),
-            opened.declare_queryable(keys[EVENT], partial(reply, topic=EVENT, kind="event"), complete=True),
-            opened.declare_queryable(keys[START], partial(reply, topic=START, kind="start"), complete=True),
+            _queryable(opened, keys[REPORT], partial(take, topic=REPORT, kind="report")),
+            _queryable(opened, keys[EVENT], partial(take, topic=EVENT, kind="event")),
+            _queryable(opened, keys[START], partial(take, topic=START, kind="start")),
             opened.liveliness().declare_token(ALIVE.under(own.site, own.machine)),
         )
 
@@ -449,7 +433,15 @@ class Publisher:
             except CommandRefusedError as error:
                 query.reply_err(str(error))
 
-        return (opened.declare_queryable(key, lambda query: self._answers.add(query, obey), complete=True),)
+        return (_queryable(opened, key, lambda query: self._answers.add(query, obey)),)
+
+
+def _queryable(opened: zenoh.Session, key: str, take: Callable[[zenoh.Query], None]) -> Declared:
+    """Declare a queryable whose queries ``take`` gets in the thread that receives them, so that it waits for nothing.
+
+    Otherwise Zenoh starts a thread for each queryable.
+    """
+    return opened.declare_queryable(key, zenoh.handlers.Callback(take, indirect=False), complete=True)
 
 
 def _notices(archive: HistoryWriter | None) -> dict[float, float]:

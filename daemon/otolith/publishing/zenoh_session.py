@@ -148,12 +148,17 @@ def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive:
 
 
 class QueryAnswers:
-    """Answers queries of the history: one at a time, and for a share of the time, so that they delay no report."""
+    """Answers queries: one at a time, and those of the history for a share of the time, so that they delay no report.
 
-    def __init__(self) -> None:
+    No query is answered in the thread in which Zenoh receives it: an answer may wait for who asks.
+    """
+
+    def __init__(self, name: str = "answer-queries", share: float = SHARE) -> None:
+        """``name`` is that of its thread, and ``share`` that of a core which it may take for long."""
+        self._share = share
         self._waiting: queue.Queue[tuple[float, zenoh.Query, Callable[[zenoh.Query], None]]] = queue.Queue(MAX_QUERIES)
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="answer-queries", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._told = -LOG_PAUSE
         self.refused = 0  # Queries, since the start
         self._thread.start()
@@ -178,7 +183,7 @@ class QueryAnswers:
             except queue.Empty:
                 continue
             now = time.monotonic()
-            credit, since = min(BURST, credit + SHARE * (now - since)), now
+            credit, since = min(BURST, credit + self._share * (now - since)), now
             begun = time.thread_time()
             try:
                 if now - arrived > MAX_WAIT:
@@ -190,7 +195,7 @@ class QueryAnswers:
                 log.exception("a query is not answered")
             credit -= time.thread_time() - begun
             if credit < 0.0:
-                self._stopping.wait(-credit / SHARE)
+                self._stopping.wait(-credit / self._share)
 
     def _refuse(self, asked: zenoh.Query) -> None:
         self.refused += 1
@@ -198,7 +203,7 @@ class QueryAnswers:
             asked.reply_err("too many queries: ask again later, and for more documents at a time")
         if (now := time.monotonic()) - self._told >= LOG_PAUSE:
             self._told = now
-            log.warning("queries of the history come too fast: %d were refused since the start", self.refused)
+            log.warning("queries come too fast: %d were refused since the start", self.refused)
 
 
 @dataclass(frozen=True, slots=True)
