@@ -36,7 +36,8 @@ def changes_of_hall(served: Sequence[Service], paths: Sequence[Path]) -> Changes
     """
     by_path = {service.path: service for service in served}
     by_names = {service.names: service for service in served}
-    empty = [path.absolute() for path in paths if not path.is_file() and not files_in([path])]
+    unusable = (path for path in paths if not path.is_file() and not (path.is_dir() and files_in([path])))
+    empty = [path.absolute() for path in unusable]
     files = read_files([path for path in paths if path.absolute() not in empty], by_path)
     changes = Changes(refused=tuple(each for each in files.refused if each.path not in by_path))
     changes.kept.extend((by_path[each.path], each.reason) for each in files.refused if each.path in by_path)
