@@ -210,7 +210,7 @@ def test_a_receiver_that_raises_ends_no_other_recording(tmp_path: Path) -> None:
 def test_rows_have_the_same_samples_however_many_are_taken(step: int) -> None:
     random = np.random.default_rng(0)
     columns = {name: np.where(random.random(250) < 0.3, np.nan, random.random(250)) for name in "ab"}
-    times, numbers = np.arange(250) * 0.01, np.zeros(250, dtype=np.int64)
+    times, numbers = np.linspace(0.0, 2.49, 250), np.zeros(250, dtype=np.int64)
     ready = SamplesOfRows(Rows(times, columns, numbers, numbers), times)
     taken = [sample for first in range(0, 250, step) for sample in ready.take(first, min(first + step, 250))]
     rows = range(250)
