@@ -5,6 +5,7 @@ Nothing here changes what a daemon has learned or writes a file: each method ret
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,7 @@ from otolith.health.labels import TimeLabels
 from otolith.health.prognosis import forecast, with_baselines
 from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, load_machine
+from otolith.notebook_arguments import is_table, path_of, plan_of, seconds_of, seed_of, span_of, text_of
 from otolith.runtime.replay import Replay, open_recordings
 from otolith.runtime.simulation_inputs import PlannedRows, RecordedStretch, read_inputs, read_recorded
 from otolith.simulation import what_if
@@ -34,22 +36,34 @@ from otolith.simulation.prediction import Prediction
 from otolith.simulation.simulate import simulate, substeps_of
 from otolith.storage.history import MINUTE, RESOLUTIONS, HistoryReader, HistorySample, history_path
 from otolith.storage.state_store import store_of
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, shown
 from otolith_drivers.units import quantity_text
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """A parameter of the twin as it is known now."""
+    """A parameter of the twin as it is known now.
+
+    Attributes:
+        name: as in the twin file; of an amplitude or another value of a component what it is of.
+        value: in ``unit``.
+        sd: standard deviation, in ``unit``; 0 of one that is given.
+        low: lower end of the 95 % interval, in ``unit``.
+        high: upper end of the 95 % interval, in ``unit``.
+        unit: as in the twin file, ``1`` for a number without unit.
+        trend_per_hour: in ``unit`` per hour; 0 of one that is given.
+        is_estimated: false of a parameter whose value the machine file or a person gives.
+        meaning: what it is, for people.
+    """
 
     name: str
-    value: float  # In unit
-    sd: float  # Standard deviation, in unit; 0 of one that is given
-    low: float  # Lower end of the 95 % interval, in unit
-    high: float  # Upper end
+    value: float
+    sd: float
+    low: float
+    high: float
     unit: str
-    trend_per_hour: float  # In unit per hour; 0 of one that is given
-    is_estimated: bool  # False of a parameter whose value the machine file or a person gives
+    trend_per_hour: float
+    is_estimated: bool
     meaning: str
 
     def __str__(self) -> str:
@@ -60,16 +74,24 @@ class ParameterRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """A recording beside what the twin predicts from one record to the next."""
+    """A recording beside what the twin predicts from one record to the next.
 
-    outputs: tuple[str, ...]  # Names of the outputs
-    units: tuple[str, ...]  # Of the outputs
-    times: Array  # (records,) s, as in the recording
-    measured: Array  # (records, outputs) each in its unit; not-a-number where nothing was measured
-    predicted: Array  # (records, outputs) in the same units
+    Attributes:
+        outputs: names of the outputs, the columns of the arrays.
+        units: of the outputs.
+        times: (records,) s, as in the recording.
+        measured: (records, outputs) each in its unit; not-a-number where nothing was measured.
+        predicted: (records, outputs) each in its unit.
+        normalised: (records, outputs) measured minus predicted in standard deviations: independent standard normal
+            deviates, if the twin explains the recording.
+    """
+
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
+    times: Array
+    measured: Array
+    predicted: Array
     normalised: Array
-    """(records, outputs) measured minus predicted in standard deviations: independent standard normal deviates, if the
-    twin explains the recording."""
 
     @property
     def values(self) -> Array:
@@ -77,7 +99,7 @@ class Residuals:
         return self.measured - self.predicted
 
     def rms(self) -> dict[str, float]:
-        """Return the root mean square of the residuals of each output in standard deviations: 1 for noise alone."""
+        """Return the root mean square of the residuals by output, in standard deviations: 1 for noise alone."""
         present = np.isfinite(self.measured)
         sums = np.where(present, self.normalised, 0.0) ** 2
         rms = np.sqrt(sums.sum(axis=0) / np.maximum(present.sum(axis=0), 1))
@@ -89,17 +111,21 @@ class Twin:
     """The adapted twin of one machine: its equations, discovered components, parameters with intervals, and state.
 
     ``Twin.load`` has what a daemon has learned. All values are in the units of the twin file: see
-    :attr:`parameters`, :attr:`inputs` and :attr:`outputs`.
+    :attr:`parameters`, :attr:`inputs` and :attr:`outputs`. A wrong argument is a ConfigurationError that names it.
+
+    Attributes:
+        machine: the machine file, loaded.
+        learned: what was learned of the machine.
+        posterior: the same of parameters and components, with what a person supposes.
+        labels: the Unix times of the times that the daemon counts, both in s.
+        supposed: what a person supposes of the machine, a line each.
     """
 
     machine: LoadedMachine
     learned: AdaptationState
-    """What was learned of the machine."""
     posterior: Posterior
-    """The same of parameters and components, with what a person supposes."""
     labels: TimeLabels = field(default_factory=TimeLabels)
     supposed: tuple[str, ...] = ()
-    """What a person supposes of the machine, a line each."""
 
     @classmethod
     def load(cls, path: str | Path) -> "Twin":
@@ -126,7 +152,7 @@ class Twin:
         Raises:
             otolith_drivers.errors.ConfigurationError: the file cannot be used; it says why.
         """
-        machine = load_machine(Path(path), with_driver=False)
+        machine = load_machine(path_of(path, "path", "a machine file"), with_driver=False)
         machine.try_fmu()
         names = machine.file.machine
         state = initial_state(names.name, names.site, machine.problem, machine.plan)
@@ -197,15 +223,20 @@ class Twin:
         Raises:
             otolith_drivers.errors.ConfigurationError: a recording cannot be used, or is too short for a window.
         """
-        with open_recordings(self.machine, [Path(path) for path in recordings]) as reader:
+        if not recordings:
+            raise ConfigurationError("recordings: none: give the path of at least one")
+        paths = [path_of(item, "recordings", "a recording, or several one after the other") for item in recordings]
+        with open_recordings(self.machine, paths) as reader:
             replay = Replay(self.machine, reader)
             replay.state = store_of(self.machine).decided(replay.state)
             for _ in replay.reports():
                 pass
         return Twin(self.machine, replay.state, replay.state.posterior)
 
-    def at(self, time: float) -> "Twin":
-        """Return the twin with parameters and amplitudes as they were at a Unix ``time`` (s), from its history.
+    def at(self, time: float | datetime) -> "Twin":
+        """Return the twin with parameters and amplitudes as they were at a ``time``, from its history.
+
+        ``time`` is in Unix s, or a datetime with its zone.
 
         The history has their intervals, but neither correlations nor trends: trends keep the uncertainty that they have
         now, around zero. Components that were not in the twin then are left out. The state is that of now.
@@ -213,6 +244,7 @@ class Twin:
         Raises:
             otolith_drivers.errors.ConfigurationError: there is no history, or no value of that time.
         """
+        time = seconds_of(time, "time")  # Unix s
         names, posterior = self.machine.file.machine, self.posterior
         known = _values_at(HistoryReader(history_path(names.site, names.name)), time)
         for key in self.components:
@@ -234,13 +266,23 @@ class Twin:
         return replace(self, learned=learned, posterior=posterior, supposed=(*self.supposed, f"values of {when}"))
 
     def with_value(self, name: str, value: str | float) -> "Twin":
-        """Return the twin with a parameter known to be ``value``: a number in its unit, or a text like "5.2 ohm"."""
+        """Return the twin with a parameter known to be ``value``: a number in its unit, or a text like "5.2 ohm".
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: there is no such parameter, or it cannot have this value.
+        """
+        name = text_of(name, "name", "R_a")
         posterior = what_if.with_value(self.posterior, name, value)
         row = next(row for row in self._supposing(posterior, "").parameters if row.name == name)
         return self._supposing(posterior, f"{name} = {quantity_text(row.value, row.unit)}")
 
     def without(self, component: str) -> "Twin":
-        """Return the twin without a component, by its key in :attr:`components`, or the begin of it."""
+        """Return the twin without a component, by its key in :attr:`components`, or the begin of it.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: there is no such component, or several.
+        """
+        component = text_of(component, "component", "shaft/periodic")
         return self._supposing(what_if.without_component(self.posterior, component), f"without {component}")
 
     def at_limit(self) -> "Twin":
@@ -276,52 +318,46 @@ class Twin:
 
     def simulate(
         self,
-        inputs: str | Path | Mapping[str, Any] | None = None,
+        inputs: str | Path | Mapping[str, Any] | Any = None,
         *,
         seed: int = 1,
         span: tuple[float, float] | None = None,
     ) -> Prediction:
         """Return what the twin predicts along ``inputs``, with 95 % bands of the readings.
 
-        ``inputs`` are a table with a column ``t`` (s) and one for each input, in a file or as a mapping from names to
-        sequences of numbers (rows,) in the units of :attr:`inputs`; or a recording, of which ``span`` (s, as its times)
-        may choose a part. Without ``inputs``, ``span`` (Unix s) is of what the daemon has recorded. A plan begins at
-        :attr:`time`. A recording begins with a window that shows the state of the machine, and is predicted from there
-        on.
+        ``inputs`` is a plan: a table with a column ``t`` (s, or dates with their zone) and one for each input. It is in
+        a file, or a mapping from names to sequences of numbers (rows,), or a table of pandas or pyarrow. ``V_a`` is in
+        the unit of :attr:`inputs`, ``V_a [mV]`` in that of its name; other columns are not used. Or it is the path of a
+        recording, of which ``span`` (s, as its times) may choose a part. Without ``inputs``, ``span`` (Unix s) is of
+        what the daemon has recorded.
+
+        A plan begins at :attr:`time`. A recording begins with a window that shows the state of the machine, and is
+        predicted from there on.
 
         The result has ``times`` (records,), ``values``, ``low``, ``high`` and ``measured`` (records, outputs). The same
-        ``seed`` gives the same numbers.
+        ``seed``, a whole number from 0 on, gives the same numbers.
 
         Raises:
             otolith_drivers.errors.ConfigurationError: the inputs cannot be used, or no window was learned from yet.
         """
-        if inputs is None:
-            if span is None:
-                raise ConfigurationError(
-                    "inputs: give a plan, a recording, or the span of what the daemon has recorded"
-                )
-            return self.simulate_along(read_recorded(self.machine, span), seed=seed)
-        if not isinstance(inputs, Mapping):
-            source = read_inputs(self.machine, Path(inputs), span)
+        seed, ends = seed_of(seed), None if span is None else span_of(span)
+        if is_table(inputs):
+            if ends is not None:
+                raise ConfigurationError("span: a plan is used as a whole: leave the span out")
+            times, columns = plan_of(inputs, self.inputs)
+            return self.simulate_along(PlannedRows(Path("inputs"), times, columns), seed=seed)
+        if inputs is not None:
+            what = "a plan or a recording, or a dict or a table of pandas or pyarrow"
+            source = read_inputs(self.machine, path_of(inputs, "inputs", what), ends)
             return self.simulate_along(source, seed=seed)
-        missing = [name for name in ("t", *self.inputs) if name not in inputs]
-        if missing:
-            raise ConfigurationError(f"inputs: {missing[0]} is missing: the plan needs t, {', '.join(self.inputs)}")
-        columns = {name: np.asarray(inputs[name], dtype=np.float64) for name in ("t", *self.inputs)}
-        times = columns.pop("t")
-        for name, column in columns.items():
-            if column.shape != times.shape or times.ndim != 1:
-                raise ConfigurationError(f"inputs: {name} has shape {column.shape}, but t has {times.shape}")
-            if not np.isfinite(column).all():
-                raise ConfigurationError(
-                    f"inputs: {name} is not finite in row {np.flatnonzero(~np.isfinite(column))[0]}"
-                )
-        if not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
-            raise ConfigurationError("inputs: t must rise from row to row, in s")
-        return self.simulate_along(PlannedRows(Path("inputs"), times, columns), seed=seed)
+        if ends is None:
+            raise ConfigurationError("inputs: give a plan, a recording, or the span of what the daemon has recorded")
+        return self.simulate_along(read_recorded(self.machine, ends), seed=seed)
 
     def simulate_along(self, source: PlannedRows | RecordedStretch, *, seed: int = 1) -> Prediction:
         """Return the same as :meth:`simulate` for inputs that were read; raises as it."""
+        if not isinstance(source, PlannedRows | RecordedStretch):
+            raise ConfigurationError(f"source: {shown(source)}: give what was read, or call simulate")
         possible = self._possible
         phase = possible[0][1].phase
         try:
@@ -376,7 +412,7 @@ class Twin:
         Raises:
             otolith_drivers.errors.ConfigurationError: the recording cannot be used.
         """
-        source = read_inputs(self.machine, Path(recording))
+        source = read_inputs(self.machine, path_of(recording, "recording", "a recording"))
         if isinstance(source, PlannedRows):
             raise ConfigurationError(f"{recording}: has not all outputs of the twin: {', '.join(self.outputs)}")
         posterior, parts, names = self.posterior, [], tuple(self.outputs)
@@ -413,6 +449,8 @@ class Twin:
         from otolith.exchange.model_description import Version  # noqa: PLC0415 - the same
         from otolith.runtime.fmu_archive import fmu_archive  # noqa: PLC0415 - the same
 
+        if version not in (known := [item.value for item in Version]):
+            raise ConfigurationError(f"version: {shown(version)}: give one of {', '.join(map(repr, known))}")
         twin, notes = self._exported()
         kernel, name = Stepping(self._period, substeps_of(self.posterior)), self.machine.file.machine.name
         return fmu_archive(fmu_files(twin, notes, Version(version), kernel, name))

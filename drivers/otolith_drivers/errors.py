@@ -61,7 +61,7 @@ def counted(number: int, noun: str) -> str:
 
 def shown(value: object) -> str:
     """Return a value from outside as a message has it, shortened."""
-    text = repr(value)
+    text = repr(value).replace("\n", " ")  # of an array
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 

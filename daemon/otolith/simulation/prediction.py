@@ -7,6 +7,7 @@ from scipy.special import ndtr
 
 from otolith.acquisition.window import Array
 from otolith.estimation.information import QUANTILE
+from otolith_drivers.errors import ConfigurationError, nearest, shown
 
 TAIL = float(ndtr(-QUANTILE))  # probability on either side of a band
 # Thresholds: docs/reference/thresholds-simulation.md has the origin of each.
@@ -17,22 +18,36 @@ BAND_ERROR = 1e-3  # of the standard deviation of a reading: error of the ends o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Readings of the outputs as the twin predicts them, each in its unit. All numbers are finite."""
+    """Readings of the outputs as the twin predicts them, each in its unit. All numbers are finite.
 
-    outputs: tuple[str, ...]  # Names of the outputs
-    units: tuple[str, ...]  # Of the outputs
-    start: float  # Time of the first record, s
-    offsets: Array  # (records,) time since the first record, s
-    values: Array  # (records, outputs) median of the draws
-    low: Array  # (records, outputs) lower end of the 95 % band
-    high: Array  # (records, outputs) upper end
-    driving: Array  # (records, inputs) what drove the twin
-    measured: Array  # (records, outputs) readings of the same time; not-a-number where there are none
-    draws: int  # Of parameters, trends, initial state and noise
+    Attributes:
+        outputs: names of the outputs, the columns of the arrays.
+        units: of the outputs.
+        start: time of the first record, s.
+        offsets: (records,) time since the first record, s.
+        values: (records, outputs) median of the draws, each in its unit.
+        low: (records, outputs) lower end of the 95 % band, each in its unit.
+        high: (records, outputs) upper end of the 95 % band, each in its unit.
+        driving: (records, inputs) what drove the twin, each in its unit.
+        measured: (records, outputs) readings of the same time, each in its unit; not-a-number where there are none.
+        draws: number of draws of parameters, trends, initial state and noise.
+        seed: of the random generator.
+        diverges: seconds (s) after the first record from which on some draws are not finite, so that nothing is
+            predicted; None if all are.
+    """
+
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
+    start: float
+    offsets: Array
+    values: Array
+    low: Array
+    high: Array
+    driving: Array
+    measured: Array
+    draws: int
     seed: int
     diverges: float | None = None
-    """Seconds after the first record from which on some draws are not finite, so that nothing is predicted; None if
-    all are."""
 
     @property
     def times(self) -> Array:
@@ -45,7 +60,14 @@ class Prediction:
         return len(self.offsets)
 
     def column(self, output: str) -> int:
-        """Return the column of an output; raise ValueError if the twin has no such output."""
+        """Return the column of an output in the arrays.
+
+        Raises:
+            otolith_drivers.errors.ConfigurationError: the twin has no such output.
+        """
+        if output not in self.outputs:
+            hint = nearest(str(output), list(self.outputs))
+            raise ConfigurationError(f"output: the twin has no output {shown(output)}: {hint}")
         return self.outputs.index(output)
 
     def rmse(self, output: str) -> float | None:

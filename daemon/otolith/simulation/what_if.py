@@ -1,10 +1,11 @@
 """What a person supposes of the machine: another value of a parameter, or a component that is not there."""
 
 from dataclasses import replace
+from numbers import Real
 
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import slot_of
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, nearest, shown
 from otolith_drivers.units import Quantity
 
 
@@ -20,6 +21,9 @@ def with_value(posterior: Posterior, name: str, written: str | float) -> Posteri
     if name not in parameters:
         raise ConfigurationError(f"the twin has no parameter {name!r}: {nearest(name, list(parameters))}")
     parameter = problem.free[free.index(name)] if name in free else parameters[name]
+    if isinstance(written, bool) or not isinstance(written, str | Real):
+        fault = f"{name}: {shown(written)} is no value"
+        raise ConfigurationError(f"{fault}: give a number in {parameter.unit}, or a text like '5.2 {parameter.unit}'")
     text = str(written).strip()
     try:
         value = float(text)
