@@ -39,6 +39,8 @@ from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError, shown
 from otolith_drivers.units import quantity_text
 
+DIVERGES = "supposed values, or inputs far outside of their ordinary range, are the likely cause"
+
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
@@ -274,7 +276,8 @@ class Twin:
         name = text_of(name, "name", "R_a")
         posterior = what_if.with_value(self.posterior, name, value)
         row = next(row for row in self._supposing(posterior, "").parameters if row.name == name)
-        return self._supposing(posterior, f"{name} = {quantity_text(row.value, row.unit)}")
+        kept = tuple(line for line in self.supposed if not line.startswith(f"{name} = "))
+        return replace(self, supposed=kept)._supposing(posterior, f"{name} = {quantity_text(row.value, row.unit)}")
 
     def without(self, component: str) -> "Twin":
         """Return the twin without a component, by its key in :attr:`components`, or the begin of it.
@@ -358,18 +361,19 @@ class Twin:
         """Return the same as :meth:`simulate` for inputs that were read; raises as it."""
         if not isinstance(source, PlannedRows | RecordedStretch):
             raise ConfigurationError(f"source: {shown(source)}: give what was read, or call simulate")
-        possible = self._possible
-        phase = possible[0][1].phase
-        try:
-            if isinstance(source, PlannedRows):
-                start = 0.0 if phase is None else phase.next_start - self._period
+        possible, phase = self._possible, self._possible[0][1].phase
+        if isinstance(source, PlannedRows):
+            start, begin = 0.0 if phase is None else phase.next_start - self._period, float(source.times[0])
+            try:
                 window = planned_window(self.machine.twin, source.times, source.columns, self._period, start)
-                prediction, begin = simulate(possible, window, seed), float(source.times[0])
-            else:
+            except ValueError as error:
+                raise ConfigurationError(f"{source.path}: {error}") from error
+        try:
+            if not isinstance(source, PlannedRows):
                 possible, window, begin = self._after_lead(source)
-                prediction = simulate(possible, window, seed)
+            prediction = simulate(possible, window, seed)
         except ValueError as error:
-            remedy = "run the daemon, or adapt the twin to a recording" if phase is None else "see its values"
+            remedy = "run the daemon, or adapt the twin to a recording" if phase is None else DIVERGES
             raise ConfigurationError(f"{source.path}: {error}: {remedy}") from error
         return replace(prediction, start=begin)
 

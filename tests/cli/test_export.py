@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -91,7 +92,7 @@ def test_what_fails_leaves_no_file(tmp_path: Path, rows: Lines) -> None:
     with raises_saying(ConfigurationError, str(broken)):
         otolith("export", MACHINE, first, broken, "--output", output)
     assert not output.exists()
-    with pytest.raises(OSError, match="missing"):
+    with pytest.raises(click.BadParameter, match="missing"):
         otolith("export", MACHINE, first, "--output", tmp_path / "missing" / "all.parquet")
 
 

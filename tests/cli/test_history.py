@@ -130,12 +130,13 @@ def test_each_change_of_an_event_has_its_evidence(written: HistoryWriter) -> Non
     assert "reproduce" not in run(MACHINE).stdout
 
 
-def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter, tmp_path: Path) -> None:
+def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter) -> None:
+    """A folder in which nobody may write a file."""
     del written
-    path = tmp_path / "missing" / "values.parquet"
-    error = run(MACHINE, "--parquet", str(path)).exception
+    path = "/proc/values.parquet"
+    error = run(MACHINE, "--parquet", path).exception
     assert isinstance(error, OSError)
-    assert error.filename == str(path)
+    assert error.filename == path
 
 
 def test_a_history_that_was_set_aside_is_opened_by_its_path(written: HistoryWriter) -> None:
@@ -179,6 +180,7 @@ def test_since_is_an_age_or_a_date(written: HistoryWriter) -> None:
         ((MACHINE, "--csv", "--json"), "give one of"),
         ((MACHINE, "--events", "--parquet", "x.parquet"), "give --csv or --json"),
         ((MACHINE, "--parquet", "/dev/null"), "exists"),
+        ((MACHINE, "--parquet", "/missing/x.parquet"), "no folder"),
     ],
 )
 def test_a_wrong_argument_names_the_way_out(written: HistoryWriter, arguments: tuple[str, ...], message: str) -> None:

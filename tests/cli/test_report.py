@@ -16,6 +16,7 @@ from otolith.cli.main import cli
 from otolith.storage.history import history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError
+from tests.messages import assert_says
 from tests.storage.histories import MACHINE, SITE, documents
 
 
@@ -75,8 +76,8 @@ def test_a_wrong_argument_names_the_way_out(arguments: tuple[str, ...], message:
 
 def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
     error = run(MACHINE, "--output", str(tmp_path / "missing" / "report.html")).exception
-    assert isinstance(error, OSError)
-    assert error.filename == str(tmp_path / "missing" / "report.html")
+    assert isinstance(error, click.BadParameter)
+    assert_says(error.message, str(tmp_path / "missing"), "report.html")
 
 
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:

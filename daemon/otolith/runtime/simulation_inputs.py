@@ -129,7 +129,8 @@ def _check(machine: LoadedMachine, data: Path, rows: Rows) -> None:
         blank = np.flatnonzero(~np.isfinite(rows.columns[item.name]))
         if len(blank):
             where = f"{data}:{rows.lines[int(blank[0])]}: no value of {item.name} [{item.unit}]"
-            raise ConfigurationError(f"{where}, {item.meaning}: write one in each row, or leave the row out")
+            or_none = "or one so large that it stands for none"
+            raise ConfigurationError(f"{where}, {item.meaning}, {or_none}: write one in each row, or leave the row out")
 
 
 def read_recorded(machine: LoadedMachine, span: tuple[float, float]) -> RecordedStretch:

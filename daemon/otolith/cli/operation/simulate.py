@@ -2,6 +2,7 @@
 
 import re
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,11 @@ def _value(_: click.Context, __: click.Parameter, written: tuple[str, ...]) -> t
     for text, (name, sign, value) in zip(written, pairs, strict=True):
         if not (name.strip() and sign and value.strip()):
             raise click.BadParameter(f"{text!r}: write a parameter and its value, like R_a=5.2 or 'R_a=5200 mohm'")
-    return tuple((name.strip(), value.strip()) for name, _, value in pairs)
+    values = tuple((name.strip(), value.strip()) for name, _, value in pairs)
+    for name, count in Counter(name for name, _ in values).items():
+        if count > 1:
+            raise click.BadParameter(f"{name} has {count} values: give one")
+    return values
 
 
 def _span(_: click.Context, __: click.Parameter, text: str | None) -> tuple[str, str] | None:
@@ -131,7 +136,13 @@ def _check(*, is_adapted: bool, has_moment: bool, prints: int) -> None:
 
 def _supposed(twin: "Twin", values: tuple[tuple[str, str], ...], removed: tuple[str, ...]) -> "Twin":
     """Return the twin with the ``values`` of parameters, and without the components ``removed``."""
+    from otolith.simulation.what_if import supposed_values
+    from otolith_drivers.errors import ConfigurationError
+
     for name, value in values:
+        if name in supposed_values(twin.posterior):
+            fault = f"{name} has the value of its limit by --until-limit"
+            raise ConfigurationError(f"--set {name}={value}: {fault}: leave one of them out")
         twin = twin.with_value(name, value)
     for key in removed:
         twin = twin.without(key)
