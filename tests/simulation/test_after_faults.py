@@ -105,10 +105,24 @@ def test_bands_of_many_runs_are_neither_too_narrow_nor_too_wide() -> None:
         assert LEAST <= share <= MOST
 
 
+@cache
+def predicted_with_noise(seed: int) -> Prediction:
+    """The same along the measured load, whose noise no prediction can leave out."""
+    values = rows_of(samples(scenario(seed)))[RECORDS * LEARNED - 1 :]
+    return simulate(learned(seed).posterior, Window.whole(0, 0.0, 0.01, tuple(SIGNALS), values))
+
+
+@pytest.mark.full
+def test_bands_of_many_runs_hold_what_the_noise_of_the_load_does() -> None:
+    """In one run the angle of the unbalance is wrong for long, so that the share of many runs counts."""
+    shares = [[predicted_with_noise(seed).coverage(name) or 0.0 for name in OUTPUTS] for seed in SEEDS]
+    for share in np.mean(shares, axis=0):
+        assert LEAST <= share <= MOST
+
+
 @pytest.mark.parametrize("seed", often([2023], [2023, 1, 2]))
 def test_bands_hold_what_is_measured_although_the_load_is_noisy(seed: int) -> None:
-    values = rows_of(samples(scenario(seed)))[RECORDS * LEARNED - 1 :]
-    predicted = simulate(learned(seed).posterior, Window.whole(0, 0.0, 0.01, tuple(SIGNALS), values))
+    predicted = predicted_with_noise(seed)
     assert all((predicted.coverage(name) or 0.0) >= LEAST for name in OUTPUTS)
     assert (predicted.rmse("omega") or np.inf) <= 1.5 * OUTPUTS["omega"]
 

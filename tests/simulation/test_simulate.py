@@ -17,6 +17,7 @@ from otolith.simulation.draws import root_of
 from otolith.simulation.initial_state import last_state, state_covariance
 from otolith.simulation.orders import with_whole_orders
 from otolith.simulation.plan import planned_window
+from otolith.simulation.prediction import Prediction
 from otolith.simulation.simulate import simulate
 from otolith.simulation.what_if import with_value, without_component
 from otolith.twin.kernel import Excitation, kernel_of
@@ -112,13 +113,30 @@ def test_process_noise_widens_the_band_as_theory_says() -> None:
     level = 0.3
     disturbed = replace(problem(), process_noise=(0.0, level))
     found = simulate(with_value(posterior(own=disturbed), "R_a", 6.5), plan(8.0))
-    tail = slice(-300, None)
-    variance = np.mean(((found.high - found.low)[tail, 1] / (2.0 * QUANTILE)) ** 2) - SENSORS[1] ** 2
+    assert speed_variance(found) == pytest.approx(stationary_variance(level), rel=0.15)
+
+
+def test_the_noise_of_a_measured_load_widens_the_band_as_theory_says() -> None:
+    """The rotor integrates it: noise of 0.2 mN·m in each record is white noise of that times the root of a period."""
+    values = np.tile([20.0, 0.02, 1.0, 10.0], (801, 1))
+    driven = Window.whole(0, 0.0, PERIOD, TWIN.signals, values)
+    found = simulate(with_value(posterior(), "R_a", 6.5), driven)
+    expected = stationary_variance(2e-4 / 0.001171 * np.sqrt(PERIOD))
+    assert speed_variance(found) == pytest.approx(expected, rel=0.15)
+    assert np.sqrt(1.0 + expected / SENSORS[1] ** 2) == pytest.approx(1.11, abs=0.02)  # as docs/simulate.md says
+
+
+def speed_variance(found: Prediction) -> float:
+    """The variance of the speed in the last seconds, without the noise of its sensor."""
+    sd = (found.high - found.low)[-300:, 1] / (2.0 * QUANTILE)
+    return float(np.mean(sd**2) - SENSORS[1] ** 2)
+
+
+def stationary_variance(level: float) -> float:
+    """The variance of a speed that white noise disturbs: P of dx = A x dt + dw, with A P + P A' = -Q."""
     a = np.array([[-6.5 / 0.673, -0.038 / 0.673], [0.038 / 0.001171, -0.00143 / 0.001171]])
-    # The stationary covariance P of dx = A x dt + dw: A P + P A' = -Q
     lyapunov = np.kron(np.eye(2), a) + np.kron(a, np.eye(2))
-    stationary = np.linalg.solve(lyapunov, -np.diag([0.0, level**2]).ravel())[3]
-    assert variance == pytest.approx(stationary, rel=0.15)
+    return float(np.linalg.solve(lyapunov, -np.diag([0.0, level**2]).ravel())[3])
 
 
 def test_a_twin_that_diverges_is_predicted_up_to_there_and_never_beyond() -> None:
