@@ -144,7 +144,8 @@ def _of_state(fmu: FmuReference) -> str:
         return "its state is set for each value, so nothing of it is saved"
     if fmu.can_restore:
         return "before each step its state is restored and start values are set"
-    return "its state cannot be restored: it is reset before each step, which begins from a fit of its start values"
+    begins = "it is reset before each step, which begins from a fit of its start values"
+    return f"its state cannot be restored: {begins}; an export with canGetAndSetFMUstate may be faster"
 
 
 def of_fmu(machine: LoadedMachine) -> list[str]:
