@@ -4,7 +4,8 @@
 
 One process publishes recorded reports of a motor under many names in windows of 2 s, as a hall does, and keeps the
 history of the first ten. Another is ``otolith site``, a third one attacks it, and this one scrapes it. Of the daemon it
-measures by how much later than due a report is published. All figures are of one run.
+measures by how much later than due a report is published, and in a browser how long after its report a fault shows. All
+figures are of one run.
 """
 
 import asyncio
@@ -25,16 +26,20 @@ import numpy as np
 import psutil
 from rich.table import Table
 
-from benchmarks.browser import browser, program
+from benchmarks.browser import Browser, browser, program
 from benchmarks.command_line import print_pages
 from benchmarks.hall import pss
 from benchmarks.pictures import simulated
+from otolith.health.limits import Level
 from otolith.publishing.publisher import Published, Publisher
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_writer import Bounds, HistoryWriter
 
 WINDOW = 2.0  # s
 KEPT = 10  # machines with a history
+CHANGED = 0  # the machine that becomes faulty, and healthy again
+CHANGES = 6  # of it that are awaited in a browser
+MAX_SHOWN = 20.0  # s until a browser must show one
 SETTLING = 8.0  # s until all machines are shown
 PAUSE = 0.2  # s between two scrapes
 PATHS = {
@@ -48,7 +53,7 @@ CLIENTS = {"pages": 100, "metrics": 50, "past": 50}
 
 
 def publish(folder: Path, endpoint: str, machines: int, end: Connection) -> None:
-    """Publish until the other end says anything but that it wants the figures since the last time."""
+    """Publish until the other end wants neither the figures since the last time nor a changed state of a machine."""
     documents = [row.document for row in simulated("healthy", 12)]
     writers = [
         HistoryWriter(folder / f"hall.press-{number}{SUFFIX}", Bounds(50_000_000, 3650, 24)) for number in range(KEPT)
@@ -59,27 +64,39 @@ def publish(folder: Path, endpoint: str, machines: int, end: Connection) -> None
     published = [
         Published("hall", f"press-{number}", writers[number] if number < KEPT else None) for number in range(machines)
     ]
-    publisher, late, count = Publisher(published, [endpoint]), list[float](), 0
-    begun = time.monotonic()
-    while True:
-        due = begun + count * WINDOW / machines
-        time.sleep(max(0.0, due - time.monotonic()))
-        number, now = count % machines, time.time()
-        report = documents[count // machines % len(documents)]
+    publisher, late, count, state = Publisher(published, [endpoint]), list[float](), 0, Level.OK
+
+    def say(number: int) -> None:
+        now, report = time.time(), documents[count // machines % len(documents)]
         window = report.window.model_copy(update={"start": now - WINDOW, "end": now})
         own = {"site": "hall", "machine": f"press-{number}", "window": window, "sequence": count + 1, "previous": None}
+        if number == CHANGED and report.health is not None:
+            own["health"] = report.health.model_copy(update={"state": state})
         report = report.model_copy(update=own)
         if number < KEPT:
             report = numbers[number].number(report)
             writers[number].add(report)
         publisher.publish(report)
+
+    begun = time.monotonic()
+    while True:
+        due = begun + count * WINDOW / machines
+        time.sleep(max(0.0, due - time.monotonic()))
+        say(count % machines)
         late.append(time.monotonic() - due)
         count += 1
-        if end.poll():
-            if end.recv() != "figures":
-                break
+        if not end.poll():
+            continue
+        wish = end.recv()
+        if wish == "figures":
             end.send(late)
             late = []
+        elif wish == "change":
+            state = Level.ACT if state is Level.OK else Level.OK
+            say(CHANGED)
+            end.send((state.name, time.monotonic()))
+        else:
+            break
     publisher.close()
     for writer in writers:
         writer.stop(5.0)
@@ -154,6 +171,19 @@ def measure(port: int, process: psutil.Process, plant: Connection, seconds: floa
             "late_max_ms": float(late.max())}  # fmt: skip
 
 
+def shown(tab: Browser, plant: Connection) -> list[float]:
+    """Return how long after its report each change of a machine shows in a browser that is open, s."""
+    found, card = list[float](), f"document.getElementById('m-hall.press-{CHANGED}').className"
+    for index in range(CHANGES):
+        time.sleep(0.17 * index)  # at another moment between two looks of the site
+        plant.send("change")
+        state, begun = plant.recv()
+        while state not in str(tab.value(card)).split() and time.monotonic() - begun < MAX_SHOWN:
+            time.sleep(0.01)
+        found.append(time.monotonic() - begun)
+    return found
+
+
 @contextmanager
 def served(folder: Path, endpoint: str, port: int) -> Iterator[psutil.Process]:
     """A site."""
@@ -166,14 +196,11 @@ def served(folder: Path, endpoint: str, port: int) -> Iterator[psutil.Process]:
             process.terminate()
 
 
-def hall_page(port: int) -> dict[str, float]:
-    """Return how long the hall takes to load in a browser, and its size."""
-    if (path := program()) is None:
-        return {}
-    with browser(path) as tab:
-        tab.open(f"http://127.0.0.1:{port}/", 1280, 720)
-        load = tab.value("performance.timing.loadEventStart - performance.timing.navigationStart")
-        size = tab.value("performance.getEntriesByType('navigation')[0].transferSize")
+def hall_page(tab: Browser, port: int) -> dict[str, float]:
+    """Return how long the hall takes to load in a browser, and its size; it stays open."""
+    tab.open(f"http://127.0.0.1:{port}/", 1280, 720)
+    load = tab.value("performance.timing.loadEventStart - performance.timing.navigationStart")
+    size = tab.value("performance.getEntriesByType('navigation')[0].transferSize")
     return {"load_s": load / 1e3, "size_kb": size / 1e3}
 
 
@@ -190,13 +217,21 @@ def run(machines: int, seconds: float, port: int) -> dict[str, dict[str, float]]
         own.send("figures")
         own.recv()
         time.sleep(SETTLING)
-        page = hall_page(port)
-        found["at rest"] = measure(port, process, own, seconds) | page
+        path = program()
+        tab = None if path is None else stack.enter_context(browser(path))
+        page = {} if tab is None else hall_page(tab, port)
+
+        def figures() -> dict[str, float]:
+            times = [] if tab is None else shown(tab, own)
+            rest = measure(port, process, own, seconds)
+            return rest | ({"shown_median_s": float(np.median(times)), "shown_max_s": max(times)} if times else {})
+
+        found["at rest"] = figures() | page
         for each in ("pages", "metrics", "past", "slow readers", "1000 connections"):
             attacker = context.Process(target=attack, args=(port, each), daemon=True)
             attacker.start()
             time.sleep(3.0)
-            found[each] = measure(port, process, own, seconds)
+            found[each] = figures()
             attacker.kill()
             attacker.join()
     return found
@@ -213,11 +248,15 @@ def main(machines: int, seconds: float, port: int, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    table = Table("attack", "scrape 50 / 100 %, ms", "MB", "cores", "report late by 50 / 99 / 100 %, ms")
+    table = Table(
+        "attack", "scrape 50 / 100 %, ms", "MB", "cores", "report late by 50 / 99 / 100 %, ms",
+        "fault shows after 50 / 100 %, s",
+    )  # fmt: skip
     for name, row in found.items():
         late = f"{row['late_median_ms']:.1f} / {row['late_99_ms']:.1f} / {row['late_max_ms']:.1f}"
         scrapes = f"{row['scrape_median_ms']:.0f} / {row['scrape_max_ms']:.0f}"
-        table.add_row(name, scrapes, f"{row['site_mb']:.0f}", f"{row['site_cores']:.2f}", late)
+        seen = f"{row['shown_median_s']:.1f} / {row['shown_max_s']:.1f}" if "shown_max_s" in row else "no browser"
+        table.add_row(name, scrapes, f"{row['site_mb']:.0f}", f"{row['site_cores']:.2f}", late, seen)
     rest = found["at rest"]
     print_pages(
         table, f"hall page: {rest.get('load_s', float('nan')):.2f} s, {rest.get('size_kb', float('nan')):.0f} kB"
