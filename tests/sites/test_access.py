@@ -6,12 +6,13 @@ import socket
 import ssl
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import urlencode
 
+import psutil
 import pytest
 
 from otolith.health.limits import Level
@@ -22,7 +23,7 @@ from otolith.publishing.commands.documents import CommandKind
 from otolith.publishing.reader_sessions import NotCarriedOutError
 from otolith.publishing.zenoh_config import Access
 from otolith.site.access.orders import FORM_AGE, MAX_FORM, MAX_ORDERS, Orders
-from otolith.site.access.users import HANDSHAKE, User
+from otolith.site.access.users import HANDSHAKE, MAX_SHAKING, User
 from otolith.site.app import FORM_TIME
 from otolith.site.settings import load_site
 from otolith.site.words import words_in
@@ -202,6 +203,17 @@ def test_who_does_not_finish_the_handshake_is_cut(anna: Served) -> None:
         assert silent.recv(1) == b""
         assert time.monotonic() - begun >= HANDSHAKE - 1.0
     assert anna.ask("/").status == 200
+
+
+@pytest.mark.full
+def test_many_handshakes_that_are_never_finished_take_little_memory_and_lock_nobody_out(anna: Served) -> None:
+    process = psutil.Process(anna.process.pid)
+    before = process.memory_info().rss
+    with ExitStack() as stack:
+        for _ in range(MAX_SHAKING + 500):
+            stack.enter_context(socket.create_connection(("127.0.0.1", anna.port), PATIENCE))
+        assert anna.ask("/").status == 200
+        assert process.memory_info().rss - before < (MAX_SHAKING + 500) * 100_000
 
 
 @pytest.mark.full

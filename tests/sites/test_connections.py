@@ -10,6 +10,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from otolith.site import server as server_module
 from otolith.site.server import MAX_UNREAD, Server, listening_on, server_of
+from otolith.site.serving.live import Places
 from otolith.site.serving.pieces import PIECE, Pieces
 from tests.conftest import free_port
 from tests.waiting import PATIENCE
@@ -133,3 +134,19 @@ def test_a_new_connection_has_the_place_of_the_one_that_waits_for_longest(monkey
         assert answer.split()[1] == b"200"
 
     with_server(SMALL, test)
+
+
+def test_one_address_leaves_places_for_live_events_to_others() -> None:
+    places = Places(8)
+    greedy = [places.take("a") for _ in range(20)]
+    assert sum(each is not None for each in greedy) == 8
+    others = [places.take(address) for address in ("b", "c", "b", "c")]
+    assert None not in others
+    ended = [each for each in greedy if each is not None and each.is_set()]
+    assert len(ended) == 4  # the oldest of the address that has most
+    assert ended == greedy[:4]
+    assert places.take("a") is None
+    for each in greedy[:8]:
+        assert each is not None
+        places.leave("a", each)
+    assert [places.take("d") is not None for _ in range(5)] == [True, True, True, True, False]

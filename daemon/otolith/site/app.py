@@ -1,6 +1,7 @@
 """The site over HTTP: pages, live events, metrics. It answers reading requests to its own names, and no others."""
 
 import asyncio
+import re
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from otolith.health.schema import LANGUAGES, Language
 from otolith.health.text import report_in, texts_in
 from otolith.health.times import moment_text
 from otolith.site.access.offers import offers_of
-from otolith.site.access.orders import MAX_FORM, OrderOutcome, Orders
+from otolith.site.access.orders import MAX_FORM, REFUSED_USER, OrderOutcome, Orders
 from otolith.site.access.users import User
 from otolith.site.collector import Collector
 from otolith.site.compare import peers, poor_data, week
@@ -29,7 +30,7 @@ from otolith.site.known import KnownMachine
 from otolith.site.metrics import CONTENT_TYPE, Metrics
 from otolith.site.outlets.base import OutletStatus
 from otolith.site.past import FIRST_SPAN, SPANS
-from otolith.site.serving.live import MAX_LIVE, Live
+from otolith.site.serving.live import Live, Places
 from otolith.site.serving.pace import Fresh, Turns
 from otolith.site.serving.past_pages import PastPages
 from otolith.site.serving.pieces import Pieces
@@ -48,6 +49,7 @@ MAX_SENDING = 4  # commands that are sent at a time
 MAX_REASON = 500  # characters of why a daemon refuses a command
 COMMAND = "/command"
 FIRST_PEERS = 8  # machines of a parameter that are seen at once, with those that differ
+HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\s:@/?#\[\]\\]+))(?::\d{1,5})?")
 HTML = "text/html"
 Show = Callable[[Request], Awaitable[Response]]
 STATIC = {"site.css": "text/css", "site.js": "text/javascript"}
@@ -67,6 +69,9 @@ REPORT_POLICY = (
     "form-action 'self'"
 )
 """Of a report page: it places its curves and lanes by styles of their elements, and has no script at all."""
+
+
+READ_ONLY = 405, "the site is read only"
 
 
 class Guard:
@@ -96,21 +101,29 @@ class Guard:
             await send(message)
 
         refusal = self._refusal(scope)
-        answer = self._app if refusal is None else PlainTextResponse(refusal[1] + "\n", refusal[0])
+        answer = self._app
+        if refusal is not None:  # what may follow in the connection is not read
+            answer = PlainTextResponse(refusal[1] + "\n", refusal[0], {"connection": "close"})
         await answer(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
         headers = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
         hosts = [value for name, value in headers if name == b"host"]
+        names = {name for name, _ in headers}
+        is_command = scope["method"] == "POST" and self._takes_commands and scope["path"] == COMMAND
+        if b"transfer-encoding" in names:
+            return 501, "the length of a request is stated by content-length"
+        if not is_command and any(value != "0" for name, value in headers if name == b"content-length"):
+            return (400, "a request for a page has no content") if scope["method"] in ("GET", "HEAD") else READ_ONLY
         if len(hosts) != 1 or host_named(hosts[0]) not in self._hosts:
             return 421, "this site has another name: http.hosts of its file lists the names that it answers to"
         origins = [value for name, value in headers if name == b"origin"]
-        if scope["method"] == "POST" and self._takes_commands and scope["path"] == COMMAND:
+        if is_command:
             sites = {value for name, value in headers if name == b"sec-fetch-site"}
             if origins != [f"{scope['scheme']}://{hosts[0].lower()}"] or sites - {"same-origin"}:
                 return 403, "a command is sent by a page of this site only"
         elif scope["method"] not in ("GET", "HEAD"):
-            return 405, "the site is read only"
+            return READ_ONLY
         elif any(_place(origin) != hosts[0].lower() for origin in origins):
             return 403, "this request comes from the page of another site"
         if len(scope["query_string"]) > MAX_QUERY:
@@ -127,11 +140,9 @@ def _place(origin: str) -> str:
 
 
 def host_named(header: str) -> str:
-    """Return the host of a ``Host`` header without its port."""
-    try:
-        return (urlsplit(f"//{header}").hostname or "").lower()
-    except ValueError:
-        return ""
+    """Return the host of a ``Host`` header without its port; empty if it is neither a name nor an address."""
+    match = HOST.fullmatch(header.lower())
+    return "" if match is None else match[1] or match[2]
 
 
 class SitePages:
@@ -145,7 +156,7 @@ class SitePages:
         self._collector, self._settings, self._outlets, self._orders = collector, settings, outlets, orders
         self._sending = ThreadPoolExecutor(MAX_SENDING, "send-command")
         self._hall, self._scrape = Hall(collector.knowledge, settings.timezone), Metrics(collector.knowledge)
-        self._live, self._turns = asyncio.Semaphore(MAX_LIVE), Turns()
+        self._live, self._turns = Places(), Turns()
         self._past = PastPages(collector, settings.timezone)
         pages, scrapes = (ThreadPoolExecutor(1, f"make-{name}") for name in ("pages", "metrics"))
         self._halls = {each: Fresh(partial(self._shown, each), MAX_AGE, pages) for each in LANGUAGES}
@@ -251,13 +262,13 @@ class SitePages:
 
     async def _take_order(self, request: Request) -> Response:
         """Send the command of a form, and say what came of it."""
-        language, content = self._language(request), await _form(request)
-        if self._orders is None or content is None:
+        language, user = self._language(request), _user(request)
+        if self._orders is None or user is None or not self._orders.may(user):
+            return self._told(REFUSED_USER, language)
+        if (content := await _form(request)) is None:
             return await self._message(language, "order_form", 400)
         loop = asyncio.get_running_loop()
-        return self._told(
-            await loop.run_in_executor(self._sending, self._orders.give, _user(request), content), language
-        )
+        return self._told(await loop.run_in_executor(self._sending, self._orders.give, user, content), language)
 
     def _told(self, outcome: OrderOutcome, language: Language) -> Response:
         text = words_in(language)[outcome.word].format(reason=visible(outcome.reason, MAX_REASON))

@@ -5,6 +5,7 @@ import signal
 import socket
 import ssl
 import sys
+from asyncio import sslproto
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -31,6 +32,8 @@ MAX_ALL_UNREAD = 16 << 20  # bytes that wait for all readers together
 SEND_BUFFER = 128 << 10  # bytes of a connection that the kernel keeps
 BACKLOG = 512  # connections that wait to be accepted
 ACCEPTED = 16  # connections that are accepted in one step of the loop
+LOGGED = "error"  # Not each request that is malformed: anybody can send many
+TLS_BUFFER = 16 << 10  # bytes of an encrypted connection that are read at a time; asyncio keeps a buffer for each
 CLOSING = 3  # s for requests that have begun when the site ends
 SWITCH = 0.001  # s that a thread may keep the others waiting
 
@@ -44,6 +47,8 @@ class _Patient(H11Protocol):
         self._phase: tuple[object, bool] = (None, True)  # Its request, and whether it waits for the next one
         self._since = self.loop.time()  # When it last came on
         self.app_state = {**self.app_state, "user": user_of(transport)}
+        if isinstance(self.loop, Loop):
+            self.loop.has_shaken(self)
         if len(self.connections) > MAX_CONNECTIONS:
             self._make_room()
 
@@ -127,8 +132,8 @@ class Server(uvicorn.Server):
 def server_of(app: ASGIApp, tls: ssl.SSLContext | None = None) -> Server:
     """Return what serves an application, encrypted if ``tls`` is given."""
     return Server(uvicorn.Config(
-        app, http=_Patient, ws="none", lifespan="off", log_config=None, access_log=False, server_header=False,
-        date_header=True, limit_concurrency=MAX_CONNECTIONS + ACCEPTED, backlog=ACCEPTED,
+        app, http=_Patient, ws="none", lifespan="off", log_config=None, log_level=LOGGED, access_log=False,
+        server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS + ACCEPTED, backlog=ACCEPTED,
         timeout_keep_alive=round(PATIENCE), timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
         ssl_context_factory=None if tls is None else lambda *_: tls,
     ))  # fmt: skip
@@ -164,6 +169,7 @@ def run_site(
     """
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH)
+    sslproto.SSLProtocol.max_size = TLS_BUFFER
     orders = None if access is None else Orders(access.users, access.signer, collector.command)
     pages = SitePages(collector, settings, [outlet.status for outlet in outlets], orders)
     server = server_of(pages.app(), None if access is None else access.tls)

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary, ref
 
 from otolith.publishing.certificates import Identity, check_identity, utc_now
 from otolith.site.settings import SiteFile
 from otolith_drivers.errors import ConfigurationError
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
+MAX_SHAKING = 1000  # TLS handshakes at a time
 HANDSHAKE = 10.0  # s for the TLS handshake of a browser
 
 
@@ -72,10 +74,30 @@ def _context(own: Identity, hosts: Iterable[str]) -> ssl.SSLContext:
 
 
 class Loop(asyncio.SelectorEventLoop):
-    """An event loop that bounds the time of a TLS handshake, which uvicorn does not."""
+    """An event loop that bounds the TLS handshakes under way, and their time, which uvicorn does not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shaking: WeakKeyDictionary[asyncio.BaseProtocol, ref[asyncio.Transport]] = WeakKeyDictionary()
+
+    def has_shaken(self, protocol: asyncio.BaseProtocol) -> None:
+        """Its handshake has ended well; those that failed are gone by themselves."""
+        self._shaking.pop(protocol, None)
 
     async def create_server(self, *arguments: Any, **options: Any) -> Listening:
         """Listen as the loop does."""
         if options.get("ssl") is not None:
             options["ssl_handshake_timeout"] = HANDSHAKE
         return await super().create_server(*arguments, **options)
+
+    def _make_ssl_transport(
+        self, connection: Any, protocol: asyncio.BaseProtocol, *arguments: Any, **options: Any
+    ) -> Any:
+        """Begin a handshake as the loop does; of too many, the oldest is cut."""
+        made: Any = super()._make_ssl_transport(connection, protocol, *arguments, **options)  # type: ignore[misc]  # typeshed has no private methods
+        self._shaking[protocol] = ref(made)
+        if len(self._shaking) > MAX_SHAKING:
+            oldest = self._shaking.pop(next(iter(self._shaking)))()
+            if oldest is not None:
+                oldest.abort()
+        return made

@@ -1,6 +1,7 @@
 """Server-sent events: the cards that changed, to each browser that shows the hall."""
 
 import asyncio
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
 
 from starlette.responses import PlainTextResponse, Response
@@ -14,30 +15,62 @@ MAX_LIVE = 64  # browsers that get live events at a time
 TICK = 1.0  # s between two looks for what has changed
 
 
+class Places:
+    """Of the streams that may run: an address that has many of them gives way to one that has fewer."""
+
+    def __init__(self, count: int = MAX_LIVE) -> None:
+        self._free = count
+        self._held: defaultdict[str, list[asyncio.Event]] = defaultdict(list)  # By address, the oldest first
+
+    def take(self, address: str) -> asyncio.Event | None:
+        """Return what is set once the place is another's; None if there is none."""
+        if self._free:
+            self._free -= 1
+        else:
+            most = max(self._held, key=lambda key: len(self._held[key]))
+            if len(self._held[most]) < len(self._held[address]) + 2:
+                return None
+            self._held[most].pop(0).set()
+        self._held[address].append(ended := asyncio.Event())
+        return ended
+
+    def leave(self, address: str, ended: asyncio.Event) -> None:
+        """Give the place back, unless it is another's."""
+        if not ended.is_set():
+            self._held[address].remove(ended)
+            self._free += 1
+        if not self._held[address]:
+            del self._held[address]
+
+
 class Live(Response):
     """A stream of events; who does not take them is cut by the server, as every slow reader."""
 
-    def __init__(self, look: Callable[[], Awaitable[Shown]], chosen: Filter, free: asyncio.Semaphore) -> None:
-        """``look`` returns the hall, ``free`` has a place for each stream that may run."""
+    def __init__(self, look: Callable[[], Awaitable[Shown]], chosen: Filter, places: Places) -> None:
+        """``look`` returns the hall."""
         super().__init__(media_type="text/event-stream")
-        self._look, self._chosen, self._free = look, chosen, free
+        self._look, self._chosen, self._places = look, chosen, places
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send events until the browser leaves."""
-        if self._free.locked():
+        """Send events until the browser leaves, or its place is another's."""
+        address = (scope.get("client") or ("", 0))[0]
+        ended = self._places.take(address)
+        if ended is None:
             text = f"{MAX_LIVE} browsers get live events already\n"
             await PlainTextResponse(text, 503)(scope, receive, send)
             return
-        async with self._free:
+        try:
             headers = [(name, value) for name, value in self.raw_headers if name != b"content-length"]
             await send({"type": "http.response.start", "status": 200, "headers": headers})
-            tasks = asyncio.ensure_future(self._run(send)), asyncio.ensure_future(_left(receive))
+            tasks = [asyncio.ensure_future(each) for each in (self._run(send), _left(receive), ended.wait())]
             try:
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             finally:
                 for task in tasks:
                     task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
+        finally:
+            self._places.leave(address, ended)
 
     async def _run(self, send: Send) -> None:
         known: dict[str, Rendered] = {}
