@@ -298,3 +298,13 @@ def test_the_worst_comes_first_and_of_equals_the_one_that_waits_for_longest() ->
     take(knowledge, report_of("e").model_copy(update={"health": health.model_copy(update={"since": 0.0})}))
     knowledge.take_alive(f"otolith/{SITE}/f/alive", START, is_alive=True)
     assert "".join(machine.name for machine in knowledge.worst_first(START)) == "ebdcfa"
+
+
+def test_machines_that_are_well_are_ordered_as_people_count() -> None:
+    knowledge = Knowledge()
+    for number in (10, 2, 1):
+        report = report_of(f"press-{number}")
+        assert report.health is not None
+        health = report.health.model_copy(update={"since": float(number % 10)})  # since when is not shown
+        take(knowledge, report.model_copy(update={"health": health}))
+    assert [machine.name for machine in knowledge.worst_first(START)] == ["press-1", "press-2", "press-10"]

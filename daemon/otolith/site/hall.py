@@ -12,7 +12,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import LANGUAGES, Language
 from otolith.health.text import texts_in
 from otolith.site.cards import SYMBOLS, card_of
-from otolith.site.known import MAX_MACHINES, Knowledge, KnownMachine
+from otolith.site.known import MAX_MACHINES, Knowledge, KnownMachine, place_of
 from otolith.site.words import words_in
 
 SHOWN = (Level.ACT, Level.WATCH, Level.NO_DATA, Level.OK)  # States of machines, the most severe first
@@ -115,8 +115,8 @@ class Hall:
 
     def _render(self, machine: KnownMachine, state: Level, now: float, language: Language) -> Rendered:
         card = card_of(machine, now, language, self._zone)
-        health = machine.report.health if machine.report else None
-        order = f"{9 - state.rank} {health.since if health else 0.0:015.1f} {machine.site} {machine.name}"
+        rank, since, site, name = place_of(machine, state)
+        order = f"{rank} {since:015.1f} {site} {name}"
         html = self._card.render(card=card, order=order, language=language, words=words_in(language))
         event = _event("card", {"id": card.id, "html": html})
         return Rendered(machine.site, machine.name, state, html.encode(errors="replace"), event)

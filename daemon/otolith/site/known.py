@@ -6,6 +6,7 @@ read, is not too large, and is of the machine that its key names. Invented machi
 ones, not of those that report for longer.
 """
 
+import re
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -133,6 +134,18 @@ def share_of(parameter: ParameterDocument) -> float | None:
     return (value - healthy) / (parameter.limit - healthy)
 
 
+def place_of(machine: KnownMachine, state: Level) -> tuple[int, float, str, str]:
+    """Return by what machines are ordered. Since when one is at OK is not shown, so that it is no order for people."""
+    health = machine.report.health if machine.report else None
+    since = health.since if health is not None and state is not Level.OK else 0.0
+    return 9 - state.rank, since, _by_number(machine.site), _by_number(machine.name)
+
+
+def _by_number(name: str) -> str:
+    """Return what orders ``press-2`` before ``press-10``."""
+    return re.sub(r"\d+", lambda found: found[0].zfill(20), name)
+
+
 class Knowledge:
     """All machines. It is of one thread at a time."""
 
@@ -160,13 +173,8 @@ class Knowledge:
         return self._machines.get(f"{site}/{name}")
 
     def worst_first(self, now: float) -> list[KnownMachine]:
-        """Return the machines, the most severe states first, then those that are in it for longest."""
-
-        def order(machine: KnownMachine) -> tuple[int, float, str, str]:
-            health = machine.report.health if machine.report else None
-            return -machine.state(now).rank, health.since if health else 0.0, machine.site, machine.name
-
-        return sorted(self, key=order)
+        """Return the machines, the most severe states first, then those that are in it for longest; at OK by name."""
+        return sorted(self, key=lambda machine: place_of(machine, machine.state(now)))
 
     def take(self, key: str, content: bytes, now: float, *, answered: float | None = None) -> KnownMachine | None:
         """Take a document that came under a key, and return its machine if it was taken, or had been before.
