@@ -8,8 +8,9 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.packed_state import PackedState
 from otolith.health.schema import Report
+from otolith.kernel_cache import CompileStep
 from otolith.runtime.hall.machine import Machine, Task, WorkerResult
-from otolith.runtime.hall.pool import COMPILE_TIMEOUT, WINDOW_TIMEOUT, Pool
+from otolith.runtime.hall.pool import COMPILE_TIMEOUT, TURN, WINDOW_TIMEOUT, Pool
 from otolith.runtime.worker import Ready, perform
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.acquisition.series import uncut
@@ -21,7 +22,7 @@ class Process:
     """A worker process that answers when the test says so."""
 
     def __init__(self) -> None:
-        self.alive, self.starts, self.processor_time = True, 1, 0.0
+        self.alive, self.starts, self.processor_time = False, 0, 0.0
         self.taken: list[tuple[PackedState, Task]] = []
         self.sent: list[object] = [Ready()]
         self.started: list[PackedState] = []
@@ -62,14 +63,19 @@ def hall() -> Halls:
     """Function that returns a pool with so many machines and workers, which are ready."""
 
     def made(machines: int, workers: int) -> tuple[Pool, list[Machine], list[Process]]:
-        served = [machine_of(state_for("R_a")) for _ in range(machines)]
-        pool, processes = Pool(served, workers), [Process() for _ in range(workers)]
-        for worker, process in zip(pool.workers, processes, strict=True):
-            worker.process = process  # type: ignore[assignment]  # has the methods that are used
-        pool.poll(0.0)
-        return pool, served, processes
+        return hall_of([machine_of(state_for("R_a")) for _ in range(machines)], workers)
 
     return made
+
+
+def hall_of(served: list[Machine], workers: int) -> tuple[Pool, list[Machine], list[Process]]:
+    """A pool for these machines, whose workers are ready."""
+    pool, processes = Pool(served, workers), [Process() for _ in range(workers)]
+    for worker, process in zip(pool.workers, processes, strict=True):
+        worker.process = process  # type: ignore[assignment]  # has the methods that are used
+    pool.start(0.0)
+    pool.poll(0.0)
+    return pool, served, processes
 
 
 @pytest.fixture
@@ -213,3 +219,82 @@ def test_no_window_waits_for_a_worker_that_starts_while_another_one_is_ready(
     assert other.alive
     pool.poll(5.0 + COMPILE_TIMEOUT + WINDOW_TIMEOUT)
     assert not other.alive  # it hangs while it starts, although it has no window
+
+
+HOSTILE, WELL, NEW = "R_a", "D", "J"  # The parameter that a machine estimates: each needs kernels of its own
+
+
+def hangs(process: Process) -> None:
+    """From now on the process compiles a kernel that has no end."""
+    process.sent = [CompileStep("kernel", is_end=False, compiled=False)]
+
+
+def test_a_twin_that_hangs_while_it_is_compiled_leaves_a_worker_to_the_others(
+    tasks: list[Task], report: Report
+) -> None:
+    """Both workers hung for ten minutes: one at its start, the other in the first window of this machine."""
+    machines = [machine_of(state_for(name)) for name in (HOSTILE, HOSTILE, WELL, WELL)]
+    pool, processes = Pool(machines, 2), [Process(), Process()]
+    for worker, process in zip(pool.workers, processes, strict=True):
+        worker.process = process  # type: ignore[assignment]  # has the methods that are used
+    pool.start(0.0)
+    stuck, free = processes if processes[0].started[0] is machines[0].packed else processes[::-1]
+    assert free.started[0] is machines[2].packed  # not that of the other hostile one
+    hangs(stuck)
+    pool.poll(0.1)
+    for second in range(1, 50):
+        for machine in machines:
+            pool.submit(machine, tasks[second % len(tasks)], float(second))
+        for _ in range(2):
+            taken = pool.workers[processes.index(free)].machine
+            assert taken in machines[2:]
+            free.finish(report)
+            pool.poll(float(second))
+    assert machines[2].finished == machines[3].finished == 49
+    assert machines[2].missed == machines[3].missed == 0
+
+
+def test_kernels_that_hang_are_killed_early_while_others_wait_to_be_compiled(tasks: list[Task], report: Report) -> None:
+    machines = [machine_of(state_for(name)) for name in (HOSTILE, WELL, NEW)]
+    pool, processes = Pool(machines, 2), [Process(), Process()]
+    for worker, process in zip(pool.workers, processes, strict=True):
+        worker.process = process  # type: ignore[assignment]  # has the methods that are used
+    pool.start(0.0)
+    stuck, free = processes if processes[0].started[0] is machines[0].packed else processes[::-1]
+    hangs(stuck)
+    pool.poll(0.0)
+    pool.poll(TURN + 1.0)
+    assert stuck.alive  # nobody waits for it
+    pool.submit(machines[2], tasks[0], TURN + 1.0)
+    assert not free.taken  # kernels that are new leave a worker to the others
+    pool.poll(TURN + 2.0)
+    assert not stuck.alive
+    pool.poll(TURN + 2.0)
+    pool.poll(TURN + 2.0)
+    assert stuck.alive
+    assert stuck.started[-1] is not machines[0].packed
+    busy = next(process for process in processes if process.taken)
+    busy.finish(report)
+    assert [machine for machine, _ in pool.poll(TURN + 3.0)] == [machines[2]]
+
+
+def test_a_kernel_that_compiles_slowly_has_more_time_with_each_turn(tasks: list[Task]) -> None:
+    """So that also a slow computer compiles it in the end; here with one worker."""
+    slow, other = (machine_of(state_for(name)) for name in (HOSTILE, NEW))
+    pool, (slow, other), (worker,) = hall_of([slow, other], 1)
+    times = list[float]()
+    for _ in range(6):
+        pool._known.clear()
+        pool._failures[other.kernels] = 100  # so that the worker begins with the slow one
+        worker.alive = False
+        pool.poll(0.0)
+        hangs(worker)
+        pool.poll(0.0)
+        pool.submit(other, tasks[0], 0.0)
+        now = 0.0
+        while worker.alive:
+            now += 1.0
+            pool.poll(now)
+        times.append(now)
+    assert times[:3] == pytest.approx([TURN, 2.0 * TURN, 4.0 * TURN], abs=2.0)
+    assert times[-1] > COMPILE_TIMEOUT

@@ -50,6 +50,7 @@ log = logging.getLogger(__name__)
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 LOOK_INTERVAL = 0.1  # s between two looks at the recorder, and whether windows are being finished
+MIN_WORKERS = 2  # of a hall: a window that takes long leaves one to the others
 STATUS_INTERVAL = 2.0  # s between two lines for systemd about a hall
 STORAGE_FLUSH, STORAGE_FLUSH_OF_MACHINE = 1.5, 0.03  # s to finish writing at the end of a hall, and for each machine
 
@@ -392,13 +393,14 @@ class HallSetup:
 
 
 def hall_of(paths: Sequence[Path], files: MachineFiles, listen: tuple[str, ...] | None, workers: int | None) -> Daemon:
-    """Return the hall of several machines; without a number, there are as many ``workers`` as processors.
+    """Return the hall of several machines; without a number, there are as many ``workers`` as processors, but two.
 
     Raises:
         ServiceError: no machine can be served.
     """
     parts = SharedParts(RecorderProcess(), OutletProcess(), StorageThread())
-    hall = HallSetup(tuple(paths), listen, (os.cpu_count() or 1) if workers is None else workers, parts, files.refused)
+    most = max(MIN_WORKERS, os.cpu_count() or 1) if workers is None else workers
+    hall = HallSetup(tuple(paths), listen, most, parts, files.refused)
     services = [hall.service_of(machine) for machine in files.machines.values()]
     usable = [service for service in services if isinstance(service, Service)]
     if not usable:

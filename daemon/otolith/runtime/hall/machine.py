@@ -14,6 +14,7 @@ from typing import Self
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict, Window
 from otolith.acquisition.windower import RawWindow, Windower
+from otolith.adaptation.fingerprints import kernels_fingerprint
 from otolith.adaptation.packed_state import PackedState
 from otolith.adaptation.state import AdaptationState, initial_state, with_sample_grid
 from otolith.estimation.problem import WindowOptions
@@ -79,6 +80,8 @@ class Machine:
         self.rings, self.windower, self.longest = rings, windower, longest
         self.packed = PackedState.of(state)
         """State after the last finished window."""
+        self.kernels = kernels_fingerprint(state.problem)
+        """The same for machines whose windows need the same kernels."""
         self.numbers = Numbers(0.0)
         self.windows = 0  # That were due
         self.missed = 0
