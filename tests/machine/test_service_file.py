@@ -131,6 +131,8 @@ def test_a_folder_with_the_service_file_alone_has_no_machine(folder: Path) -> No
     with raises_saying(ConfigurationError, "no machine", str(folder)):
         serve([folder], None, None, None)
     assert changes_of_hall([], [folder]).new == []
+    for path in (folder, folder / "away"):
+        assert changes_of_hall([], [path]).refused == ()
 
 
 def test_what_is_wrong_with_certificates_is_said_of_the_file_that_names_them(folder: Path) -> None:

@@ -23,12 +23,13 @@ class Process:
 
     def __init__(self) -> None:
         self.alive, self.starts, self.processor_time = False, 0, 0.0
+        self.is_quick = True  # Whether it is ready as soon as it has started
         self.taken: list[tuple[PackedState, Task]] = []
         self.sent: list[object] = [Ready()]
         self.started: list[PackedState] = []
 
     def start(self, state: PackedState) -> None:
-        self.alive, self.starts, self.sent = True, self.starts + 1, [Ready()]
+        self.alive, self.starts, self.sent = True, self.starts + 1, [Ready()] * self.is_quick
         self.started.append(state)
 
     def may_restart(self, _: float) -> bool:
@@ -219,6 +220,16 @@ def test_no_window_waits_for_a_worker_that_starts_while_another_one_is_ready(
     assert other.alive
     pool.poll(5.0 + COMPILE_TIMEOUT + WINDOW_TIMEOUT)
     assert not other.alive  # it hangs while it starts, although it has no window
+
+
+def test_the_window_of_a_worker_that_died_does_not_wait_until_the_next_one_has_started(
+    hall: Halls, tasks: list[Task]
+) -> None:
+    pool, (machine, _), (one, other) = hall(2, 2)
+    pool.submit(machine, tasks[0], 0.0)
+    one.alive, one.is_quick = False, False
+    pool.poll(1.0)
+    assert [task.index for _, task in other.taken] == [0]
 
 
 HOSTILE, WELL, NEW = "R_a", "D", "J"  # The parameter that a machine estimates: each needs kernels of its own

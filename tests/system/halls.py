@@ -31,6 +31,19 @@ def write(folder: Path, name: str, driver: str = "", **changes: str) -> None:
     (folder / f"{name}.toml").write_text(f'{text}\n[zenoh]\nlisten = ["{endpoint}"]\n', encoding="utf-8")
 
 
+UNITS = {"ArmatureVoltage": "V", "LoadTorque": "N*m", "ArmatureCurrent": "A", "RotorSpeed": "rad/s"}
+
+
+def write_modbus(folder: Path, name: str, options: str) -> None:
+    """Write the file of a machine whose signals are registers of a Modbus device."""
+    write(folder, name, f'type = "modbus"\n{options}')
+    text = (folder / f"{name}.toml").read_text(encoding="utf-8")
+    for signal_name, unit in UNITS.items():
+        own = f'{{ register = 0, type = "float32", unit = "{unit}" }}'
+        text = text.replace(f'{{ signal = "{signal_name}" }}', own)
+    (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+
+
 class RunningHall:
     """A daemon for the machines of a folder, and what it publishes of each."""
 

@@ -15,7 +15,7 @@ from otolith.storage.history import HistoryReader, history_path
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.messages import raises_saying
-from tests.system.halls import RunningHall, write
+from tests.system.halls import RunningHall, write, write_modbus
 
 GOOD = ("one", "two")
 LEARNED_BY_ANOTHER = "what another daemon has learned"
@@ -33,13 +33,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def hall(folder: Path) -> Iterator[RunningHall]:
     write(folder, "bad-file", estimate="estimat")
-    write(folder, "dead-bus", 'type = "modbus"\nhost = "127.0.0.1"\nport = 9')
-    text = (folder / "dead-bus.toml").read_text(encoding="utf-8")
-    units = {"ArmatureVoltage": "V", "LoadTorque": "N*m", "ArmatureCurrent": "A", "RotorSpeed": "rad/s"}
-    for number, (name, unit) in enumerate(units.items()):
-        own = f'{{ register = {2 * number}, type = "float32", unit = "{unit}" }}'
-        text = text.replace(f'{{ signal = "{name}" }}', own)
-    (folder / "dead-bus.toml").write_text(text, encoding="utf-8")
+    write_modbus(folder, "dead-bus", 'host = "127.0.0.1"\nport = 9')
     write(folder, "busy")
     other = store_of(load_machine(folder / "busy.toml", with_driver=False))
     write(folder, "other-name")

@@ -20,7 +20,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import ReportDocument, Status
 from otolith.storage.history import HistoryReader, history_path
 from tests.hostile import HOSTILE
-from tests.system.halls import RunningHall, write
+from tests.system.halls import RunningHall, write, write_modbus
 from tests.variants import often_rows
 from tests.waiting import PATIENCE, wait_for
 
@@ -61,7 +61,7 @@ def hall_of(folder: Path, count: int) -> tuple[RunningHall, list[str]]:
     for name in well:
         write(folder, name)
     write(folder, "diverges", **DIVERGES)
-    write(folder, "dead", 'type = "can"\nchannel = "can99"\ninterface = "socketcan"')
+    write_modbus(folder, "dead", 'host = "127.0.0.1"\nport = 9')
     for number, text in enumerate(HOSTILE):
         file = f"[machine]\nname = {json.dumps(text)}\n[twin]\nname = {json.dumps(text)}\n"
         (folder / f"hostile-{number}.toml").write_bytes(file.encode("utf-8", "surrogatepass"))

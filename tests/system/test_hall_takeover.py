@@ -15,7 +15,7 @@ from otolith.machine import load_machine
 from otolith.storage.state_store import store_of
 from tests.conftest import OwnMachine
 from tests.drivers.modbus.test_shared_line import line_of
-from tests.system.halls import ENDPOINT, RunningHall, write
+from tests.system.halls import ENDPOINT, RunningHall, write, write_modbus
 from tests.waiting import PATIENCE
 
 DONE = "machines are served"
@@ -90,9 +90,6 @@ def test_machines_are_added_changed_and_removed_without_touching_the_others(hall
     assert hall.close() == 0
 
 
-UNITS = {"ArmatureVoltage": "V", "LoadTorque": "N*m", "ArmatureCurrent": "A", "RotorSpeed": "rad/s"}
-
-
 def write_on_bus(own: OwnMachine, folder: Path, name: str) -> None:
     """Write the file of a machine on the CAN channel of the simulated plant."""
     text = own.machine.read_text(encoding="utf-8").replace('name = "dc-motor"', f'name = "{name}"', 1)
@@ -102,12 +99,7 @@ def write_on_bus(own: OwnMachine, folder: Path, name: str) -> None:
 
 def write_on_line(folder: Path, name: str, serial: Path, device: int) -> None:
     """Write the file of a machine on a serial line."""
-    write(folder, name, f'type = "modbus"\nserial = "{serial}"\ndevice = {device}\nbaudrate = 115200')
-    text = (folder / f"{name}.toml").read_text(encoding="utf-8")
-    for signal, unit in UNITS.items():
-        own = f'{{ register = 0, type = "float32", unit = "{unit}" }}'
-        text = text.replace(f'{{ signal = "{signal}" }}', own)
-    (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+    write_modbus(folder, name, f'serial = "{serial}"\ndevice = {device}\nbaudrate = 115200')
 
 
 def test_machines_that_share_a_line_or_a_channel_go_on(own_machine: OwnMachine, folder: Path, tmp_path: Path) -> None:

@@ -69,5 +69,5 @@ def _tell_where_tables_belong(files: "MachineFiles") -> None:
             if table in machine.file.model_fields_set and table not in machine.of_service
         ]
         if own:
-            whose = "of its machine alone" if len(own) == 1 else "each of its machine alone"
-            log.info("[%s] of %s is %s: %s beside them has it for all", table, some_names(own), whose, SERVICE_FILE)
+            text = "[%s] in a machine file holds for its machine alone, in %s beside them for all: %s"
+            log.info(text, table, SERVICE_FILE, some_names(own))

@@ -273,7 +273,7 @@ class Pool:
     def _allowed_seconds(self, worker: Worker) -> float:
         """Return for how long a worker may go on: less while kernels of others wait for theirs to be compiled."""
         allowed = worker.allowed_seconds(0.0 if worker.machine is None else worker.machine.longest)
-        if not worker.is_compiling:
+        if not (worker.is_compiling and worker.kernels):
             return allowed
         others = [*self._queue] if worker.machine is None else [*self._queue, worker.machine]
         waiting = [machine for machine in others if machine.kernels != worker.kernels]
@@ -285,10 +285,10 @@ class Pool:
         return machine.is_slow or machine.kernels not in self._known
 
     def _is_long(self, worker: Worker) -> bool:
-        """Whether a worker may not be free soon."""
-        if not worker.process.alive or worker.is_compiling or not worker.is_ready:
-            return True
-        return worker.machine is not None and self._may_take_long(worker.machine)
+        """Whether a worker may not be free soon; one that starts with known kernels is."""
+        if not (worker.is_ready and worker.process.alive):
+            return worker.kernels not in self._known
+        return worker.is_compiling or (worker.machine is not None and self._may_take_long(worker.machine))
 
     def _dispatch(self, now: float) -> None:
         """Give windows to workers; while one is ready, none waits for one that starts and may compile for minutes."""
