@@ -25,6 +25,7 @@ from tests.variants import often_rows
 from tests.waiting import PATIENCE, wait_for
 
 DISK = 64  # MB of the state directory
+SHORT = {"[driver]": '[window]\nlength = "1 s"\n[driver]'}
 DIVERGES = {
     "D = {": 'J = "1e-9 kg*m^2"\nD = {'
 }  # The speed of its twin changes a million times faster than the windows
@@ -59,7 +60,7 @@ def hall_of(folder: Path, count: int) -> tuple[RunningHall, list[str]]:
     folder.mkdir()
     well = [f"well-{number}" for number in range(count)]
     for name in well:
-        write(folder, name)
+        write(folder, name, **SHORT)
     write(folder, "diverges", **DIVERGES)
     write_modbus(folder, "dead", 'host = "127.0.0.1"\nport = 9')
     for number, text in enumerate(HOSTILE):
