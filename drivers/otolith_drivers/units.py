@@ -296,6 +296,7 @@ def are_equal(one: str, other: str, target: str) -> bool:
     return math.isclose(*scales, rel_tol=SAME) and math.isclose(*offsets, rel_tol=SAME, abs_tol=SAME * abs(scales[0]))
 
 
+@cache
 def to_base(text: str) -> tuple[float, float]:
     """Return ``(scale, offset)`` from the unit ``text`` to SI base units (with radians)."""
     zero = _registry().Quantity(0.0, unit(text)).to_base_units().magnitude

@@ -133,9 +133,9 @@ class BridgeError:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Records of all signals of a machine. Frozen and picklable."""
+    """Records of all signals of a machine. Frozen and picklable; equal to itself only."""
 
     index: int
     start: float  # Seconds of the first record, on the clock of the windows: service time, or the time of a log
@@ -218,6 +218,8 @@ def runs_of(mask: Mask) -> list[tuple[int, int]]:
 
 def larger_sizes(sizes: Mapping[str, float], window: Window) -> dict[str, float]:
     """Return the largest root mean square of each signal, also in ``window``."""
-    columns = ((name, window.column(name)[~window.missing_in(name)]) for name in window.signals)
-    own = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in columns if len(values)}
+    present = ~window.missing
+    values, counts = np.where(present, window.values, 0.0), present.sum(axis=0)
+    means = np.sqrt(np.einsum("rs,rs->s", values, values) / np.maximum(counts, 1)).tolist()
+    own = {name: mean for name, mean, count in zip(window.signals, means, counts.tolist(), strict=True) if count}
     return {name: max(own.get(name, 0.0), sizes.get(name, 0.0)) for name in {**sizes, **own}}

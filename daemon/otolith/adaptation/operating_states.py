@@ -5,13 +5,14 @@ of the twin do not hold there, so that such a stretch is evidence of nothing. It
 volts, in whose equation the current is zero within its noise, in a window that contradicts the twin.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from otolith.acquisition.window import Mask, Window, runs_of
 from otolith.estimation.problem import Problem
+from otolith.twin.definition import Definition
 from otolith.twin.expressions import names_in, parse
 from otolith_drivers.units import are_of_one_quantity
 
@@ -48,7 +49,7 @@ def off_records(problem: Problem, window: Window) -> Mask:
     """Return where the drive is off (records,)."""
     off, inputs = np.zeros(window.records, dtype=np.bool_), problem.base_model.inputs
     levels = dict(zip((row.name for row in inputs), problem.input_noise or (0.0,) * len(inputs), strict=True))
-    for current, commands in _driven_currents(problem):
+    for current, commands in _driven_currents(problem.base_model):
         index = [output.name for output in problem.base_model.outputs].index(current)
         reach = OFF_REACH * problem.noise[index] + (problem.steps[index] if problem.steps else 0.0)
         is_zero = (np.abs(window.readings(current)) <= reach) | window.missing_in(current)
@@ -67,13 +68,11 @@ def _end_of_current(is_zero: Mask) -> int:
     return int(ended[0]) if len(ended) else len(is_zero)
 
 
-def _driven_currents(problem: Problem) -> Iterator[tuple[str, list[str]]]:
-    """Yield each measured current that is a state, with the commands in volts of its equation."""
-    twin = problem.base_model
+@lru_cache(maxsize=64)
+def _driven_currents(twin: Definition) -> tuple[tuple[str, list[str]], ...]:
+    """Return each measured current that is a state, with the commands in volts of its equation."""
     equations = dict(twin.equations)
     volts = [row.name for row in twin.inputs if are_of_one_quantity(row.unit, "V")]
-    for output in twin.outputs:
-        rate = equations.get(f"der({output.name})")
-        commands = [name for name in volts if rate and name in names_in(parse(rate))]
-        if commands and are_of_one_quantity(output.unit, "A"):
-            yield output.name, commands
+    driven = ((output, names_in(parse(equations.get(f"der({output.name})", "0")))) for output in twin.outputs)
+    rows = ((output, [name for name in volts if name in names]) for output, names in driven)
+    return tuple((output.name, names) for output, names in rows if names and are_of_one_quantity(output.unit, "A"))

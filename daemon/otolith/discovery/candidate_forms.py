@@ -45,15 +45,20 @@ class CandidateForm(NamedTuple):
     bounds: tuple[float, float] = (0.0, 0.0)  # Of the inner parameter
 
 
-@lru_cache(maxsize=64)
-def candidate_table(base: Definition, taken: frozenset[str]) -> tuple[CandidateForm, ...]:
-    """Return the form of every component that ``base``, a twin without slots, could have, but for keys in ``taken``.
+class CandidateTable(NamedTuple):
+    """Every component that a twin could have: the bounds, and which of them a window distinguishes, depend on it."""
 
-    The bounds of inner parameters depend on the window, and so does which forms it can distinguish.
-    """
+    shapes: tuple[tuple[ComponentFamily, int], ...]  # Each family with the index of a source
+    rows: tuple[tuple[int, ComponentFamily, int, int], ...]  # Site, family, source, and index of the shape
+
+
+@lru_cache(maxsize=64)
+def candidate_table(base: Definition, taken: frozenset[str]) -> CandidateTable:
+    """Return every component that ``base``, a twin without slots, could have, but for keys in ``taken``."""
     machine_sites = len(base.sites)
-    return tuple(
-        CandidateForm(index, model, number)
+    shapes: dict[tuple[ComponentFamily, int], int] = {}
+    rows = tuple(
+        (index, model, number, shapes.setdefault((model, number), len(shapes)))
         for index, site in enumerate(sites(base))
         for model in COMPONENT_FAMILIES
         for number, source in enumerate(sources(base))
@@ -61,6 +66,7 @@ def candidate_table(base: Definition, taken: frozenset[str]) -> tuple[CandidateF
         and (index < machine_sites or (site.through == "1" and _is_sensor_error(model, source, site.into)))
         and key_of(site.name, model.name, source.name) not in taken
     )
+    return CandidateTable(tuple(shapes), rows)
 
 
 def _is_sensor_error(model: ComponentFamily, source: ComponentSource, signal: str) -> bool:

@@ -122,33 +122,27 @@ def refine_inner_parameters(
     divides that distance. In the first round there are several best ones.
     """
     forms = [form for form, _ in starts]
-    best = [list(inner) for _, inner in starts]
-    scale = 1.0
+    grids = [inner_grid(form, response.x, FINE) for form in forms]
+    best, scale = [np.array(inner) for _, inner in starts], 1.0
     for _ in range(REFINEMENTS):
-        guesses = [
-            (form, value)
-            for form, inner in zip(forms, best, strict=True)
-            for value in _around(form, response.x, np.array(inner), scale)
-        ]
-        gains = response.score(guesses).gain
-        leading: dict[CandidateForm, tuple[float, float]] = {}
-        for (form, value), gain in zip(guesses, gains.tolist(), strict=True):
-            if form not in leading or gain > leading[form][0]:
-                leading[form] = gain, value
-        best = [[leading[form][1]] for form in forms]
+        around = [_around(*row, scale) for row in zip(forms, grids, best, strict=True)]
+        guesses = [(form, value) for form, values in zip(forms, around, strict=True) for value in values]
+        ends = np.cumsum([len(values) for values in around])
+        gains = np.split(response.score(guesses).gain, ends[:-1])
+        best = [np.array(values[own.argmax()]) for values, own in zip(around, gains, strict=True)]
         scale *= NARROWER
-    return [(form, inner) for form, (inner,) in zip(forms, best, strict=True)]
+    return [(form, float(inner)) for form, inner in zip(forms, best, strict=True)]
 
 
-def _around(form: CandidateForm, x: Array, inner: Array, scale: float) -> list[float]:
-    """Return ``inner`` (starts,) and points beside each; a grid with a fixed number of points is geometric."""
-    points = inner_grid(form, x, FINE)
+def _around(form: CandidateForm, points: Array, inner: Array, scale: float) -> list[float]:
+    """Return ``inner`` (starts,) and points beside each; the grid ``points`` of a fixed number are geometric."""
     offsets = scale * np.array(OFFSETS)[:, None]
     if form.model.inner is not None and form.model.inner.points:
         around: Array = inner * (points[1] / points[0]) ** offsets
     else:
         around = inner + (points[1] - points[0] if len(points) > 1 else np.ptp(form.bounds)) * offsets
-    return [float(value) for value in np.clip(around, *form.bounds).ravel()]
+    values: list[float] = np.clip(around, *form.bounds).ravel().tolist()
+    return values
 
 
 def _without_parameters(

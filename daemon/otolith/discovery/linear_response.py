@@ -198,8 +198,11 @@ class LinearResponse(ProjectedResponse):
 
     def _input(self, index: int, values: Array) -> Array:
         """Return an input (records,); a constant where it varies by no more than its noise."""
-        noise = median(self.objective.noise.inputs[:, index])
-        return values if values.std() > MIN_INPUT_VARIATION * noise else np.full(len(values), values.mean())
+        levels, mean = self.objective.noise.inputs[:, index], float(values.mean())
+        noise = float(levels[0]) if self.window.bridge_error is None else median(levels)  # then all are the same
+        deviations = values - mean
+        varies = float(deviations @ deviations) > (MIN_INPUT_VARIATION * noise) ** 2 * len(values)
+        return values if varies else np.full(len(values), mean)
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:
         """Return about by how much χ² falls (sites, frequencies) by a sine of a source at each site of the machine.

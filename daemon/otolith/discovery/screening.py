@@ -6,6 +6,7 @@ All allowed forms are scored by the linear response, on a grid of their inner pa
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -114,7 +115,12 @@ def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
 def geometric_grids(bounds: list[tuple[float, float]], points: int, fineness: float) -> Array:
     """Return values (forms, points) between the ``bounds`` of inner parameters with grids of so many ``points``."""
     low, high = np.log(np.array(bounds)).T[..., None]
-    return np.asarray(np.exp(low + (high - low) * np.linspace(0.0, 1.0, max(round(points / fineness**2), 2))))
+    return np.asarray(np.exp(low + (high - low) * _shares(max(round(points / fineness**2), 2))))
+
+
+@cache
+def _shares(points: int) -> Array:
+    return np.linspace(0.0, 1.0, points)
 
 
 def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
@@ -122,23 +128,23 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
     ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
     """
-    ranges = SourceRange.of_each(x)
-    bounds: dict[tuple[str, int], tuple[float, float] | None] = {}
-    library = []
-    for site, model, source, _ in candidate_table(twin, taken):
-        shape = model.name, source
-        if shape not in bounds:
-            bounds[shape] = _inner_bounds(model, ranges[source])
-        if (within := bounds[shape]) is not None:
-            library.append(CandidateForm(site, model, source, within))
-    return library
+    ranges, table = SourceRange.of_each(x), candidate_table(twin, taken)
+    bounds = [_inner_bounds(model, ranges[source]) for model, source in table.shapes]
+    return [
+        CandidateForm(site, model, source, within)
+        for site, model, source, shape in table.rows
+        if (within := bounds[shape]) is not None
+    ]
 
 
 def _inner_bounds(model: ComponentFamily, x: SourceRange) -> tuple[float, float] | None:
     """Return the bounds of the inner parameter, or None if ``x`` does not single out the family."""
     if not model.valid(x):
         return None
-    return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
+    if model.inner is None:
+        return 0.0, 0.0
+    low, high = model.inner.bounds(x)
+    return (low, high) if low < high else None
 
 
 def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
@@ -329,23 +335,29 @@ def promising_guesses(response: LinearResponse, forms: list[CandidateForm], comp
     (:meth:`LinearResponse.estimated_gains_of`), a line with 4e-6 (:meth:`LinearResponse.estimated_gains`).
     """
 
+    @cache
+    def required(parameters: int, alternatives: float) -> float:
+        return ESTIMATE_SHARE * (DECISIVE + float(penalty(parameters, response.objective.count, alternatives)))
+
     def least(form: CandidateForm) -> float:
-        needed = DECISIVE + float(penalty(_parameter_count(form), response.objective.count, competing.of(form)))
-        return ESTIMATE_SHARE * needed
+        return required(_parameter_count(form), competing.of(form))
 
     lines: list[tuple[float, Guess]] = []
-    for form, grid, gains in _spectra(response, [form for form in forms if len(form.model.phases) > 1], COARSE):
+    shapes, waves = list[CandidateForm](), list[CandidateForm]()
+    for form in forms:
+        (shapes if len(form.model.phases) == 1 else waves).append(form)
+    for form, grid, gains in _spectra(response, waves, COARSE):
         lines += [(gains[at], (form, float(grid[at]))) for at in np.flatnonzero(gains > least(form))]
     lines.sort(key=lambda line: -line[0])
-    return [*_promising_shapes(response, forms, least), *(guess for _, guess in lines[:MAX_LINES])]
+    return [*_promising_shapes(response, shapes, least), *(guess for _, guess in lines[:MAX_LINES])]
 
 
 def _promising_shapes(
     response: LinearResponse, forms: list[CandidateForm], least: Callable[[CandidateForm], float]
 ) -> list[Guess]:
-    """Return the guesses of one curve on a coarse grid whose estimated gain is at ``least`` that of their form."""
-    at_site = {(form.site, form.model.name, form.source): form for form in forms if len(form.model.phases) == 1}
-    grids = _grids(response, list(at_site.values()), COARSE)
+    """Return the guesses of ``forms`` of one curve on a coarse grid whose estimated gain is at ``least`` theirs."""
+    at_site = {(form.site, form.model.name, form.source): form for form in forms}
+    grids = _grids(response, forms, COARSE)
     shapes = [(name, source, inner) for (name, source), values in grids.items() for inner in values]
     gains = response.estimated_gains_of([(family_code(name), source, inner, 0.0) for name, source, inner in shapes])
     guesses = []

@@ -187,6 +187,8 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
         return spikes
     share, spread = (0.5, 1.0) if times is None else _lines_through_neighbours(times)
     second = values[1:-1] - (share * values[:-2] + (1.0 - share) * values[2:])
+    if float(np.abs(second).max()) <= SPIKE_HEIGHT * SECOND_DIFFERENCE_SD * noise:
+        return spikes
     usual = max(MAD_TO_SD * median(np.abs(second)), SECOND_DIFFERENCE_SD * noise)
     usual = max(usual, float(np.finfo(float).eps * np.abs(values).max()))  # of the rounding of numbers
     height = SPIKE_HEIGHT * max(usual, float(np.finfo(float).tiny))
@@ -284,8 +286,9 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
     """Return the channels that keep a value which their prediction makes improbable."""
     faulty = []
     for channel in _checked_channels(predicted, window):
-        runs = _constant_runs(channel.values, channel.present)
-        is_long = _samples_in(runs) > MAX_FROZEN_SHARE * len(channel.present)
+        present = channel.present
+        runs = _constant_runs(channel.values, present)
+        is_long = _samples_in(runs) > MAX_FROZEN_SHARE * len(present)
         if is_long and (run := _frozen_run(channel, runs)) is not None:
             setting = _turned_off(channel.name, Check.FROZEN)
             faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), setting))

@@ -14,7 +14,7 @@ Filtering Theory, section 9.3).
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice
 
 import numpy as np
@@ -24,6 +24,7 @@ from otolith.estimation.evidence import Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
+from otolith.twin.kernel import Indices
 from otolith_drivers.units import unit_text
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
@@ -115,9 +116,12 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
         deviation = np.sqrt(np.maximum(covariance.diagonal(), np.finfo(float).tiny))
         blind = np.abs(rows[~observed]).max(axis=0, initial=0.0) > MAX_BLIND_SHARE
         sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * inflation)
-        correlation[np.ix_(alive, alive)] = np.where(
-            np.outer(blind, blind), 1.0, covariance / np.outer(deviation, deviation)
-        )
+        blinded = blind[:, None] & blind
+        own = np.where(blinded, 1.0, covariance / (deviation[:, None] * deviation))
+        if len(own) == len(correlation):
+            correlation = own
+        else:
+            correlation[np.ix_(alive, alive)] = own
     return Information(sd, correlation)
 
 
@@ -157,15 +161,20 @@ def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
     does not average out, so the largest long-run variance of an output counts (W. K. Newey, K. D. West, Econometrica
     55, 1987), as far as it exceeds the variance of all of them by more than chance.
     """
-    variance = long_run = max(cost, 1.0) ** 2
-    for column, measured in zip(residuals.T, present.T, strict=True):
-        series = column if measured.all() else column[measured]
-        long_run = max(long_run, _long_run_variance(series, variance))
+    variance = max(cost, 1.0) ** 2
+    if present.all():
+        of_outputs = _long_run_variances(residuals.T, variance)
+    else:
+        columns = (column[measured] for column, measured in zip(residuals.T, present.T, strict=True))
+        of_outputs = [own for series in columns for own in _long_run_variances(series[None], variance)]
+    long_run = max(variance, *of_outputs)
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
 
 
-def _long_run_variance(series: Array, expected: float) -> float:
-    """Return the variance of ``series`` plus twice its autocovariances, both as far as white noise would not show them.
+def _long_run_variances(series: Array, expected: float) -> list[float]:
+    """Return the variance of each of ``series`` (series, records) plus twice its autocovariances.
+
+    Both count as far as white noise would not show them.
 
     White noise of the variance ``expected`` has no autocovariances, and n values of it show only chance: a variance
     with the relative standard deviation √(2/n), and sums of m autocovariances with √(m/n) (M. S. Bartlett, 1946). What
@@ -173,20 +182,27 @@ def _long_run_variance(series: Array, expected: float) -> float:
     Stein, 1961). Lags of 1, 2 to 3, 4 to 7 and so on are summed. A negative sum ends the correlation (initial positive
     sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CORRELATED`` it does so by degrees.
     """
-    records = len(series)
-    variance = float(series @ series) / max(records, 1)
-    if variance == 0.0 or not np.isfinite(variance):
-        return variance
-    by_chance, lags = CORRELATED * variance / np.sqrt(records), int(MAX_LAG * records)
-    own = min(variance, expected) + float(_beyond(variance - expected, np.sqrt(2.0) * by_chance))
-    if lags < 2:
-        return own
-    spectrum = np.abs(np.fft.rfft(series, 2 ** (records + lags).bit_length())) ** 2
+    records = series.shape[1]
+    variance = np.array([own @ own for own in series]) / max(records, 1)
+    by_chance, lags = CORRELATED * variance / np.sqrt(max(records, 1)), int(MAX_LAG * records)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of series that are zero, or not finite
+        long_run = np.minimum(variance, expected) + _beyond(variance - expected, np.sqrt(2.0) * by_chance)
+        if lags >= 2:
+            spectrum = np.abs(np.fft.rfft(series, 2 ** (records + lags).bit_length())) ** 2
+            starts, lengths = _sums_of_lags(lags)
+            sums = np.add.reduceat(np.fft.irfft(spectrum)[:, 1:lags] / records, starts, axis=1)
+            limits = by_chance[:, None] * lengths
+            kept = np.minimum.accumulate(np.clip(1.0 + sums / limits, 0.0, 1.0), axis=1)
+            long_run += 2.0 * np.sum(kept * _beyond(sums, limits), axis=1)
+    of_series: list[float] = np.where((variance == 0.0) | ~np.isfinite(variance), variance, long_run).tolist()
+    return of_series
+
+
+@cache
+def _sums_of_lags(lags: int) -> tuple[Indices, Array]:
+    """Return where each sum begins among lags from one on, and the root of the number of its lags."""
     starts = 2 ** np.arange((lags - 1).bit_length()) - 1
-    sums = np.add.reduceat(np.fft.irfft(spectrum)[1:lags] / records, starts)
-    limits = by_chance * np.sqrt(np.diff(starts, append=lags - 1))
-    kept = np.minimum.accumulate(np.clip(1.0 + sums / limits, 0.0, 1.0))
-    return own + 2.0 * float(np.sum(kept * _beyond(sums, limits)))
+    return starts, np.sqrt(np.diff(starts, append=lags - 1))
 
 
 def _beyond(values: Array | float, by_chance: Array | float) -> Array:
@@ -375,7 +391,7 @@ def linearisation_errors(objective: Objective, guess: Array, jacobian: Array) ->
     if not np.isfinite(jacobian).all():
         return np.zeros((count, 0))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
+    _, singular, directions = np.linalg.svd(np.linalg.qr(jacobian / size, mode="r"))
     kept = singular > MIN_CURVED_SINGULAR * singular[0]
     steps = directions[kept] / singular[kept, None] / size
     around = np.concatenate([guess + steps, guess - steps, guess[None]])

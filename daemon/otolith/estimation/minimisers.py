@@ -8,7 +8,7 @@ multi-objective optimization in Python, IEEE Access 8, 2020). A generation is on
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -82,7 +82,8 @@ def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> Fi
             damping = _increased(damping)
         if converged or damping > MAX_DAMPING:
             break
-    return replace(reached, evaluations=evaluations, converged=converged)
+    guess, residuals, jacobian, chi_square = reached.guess, reached.residuals, reached.jacobian, reached.chi_square
+    return FitResult(guess, residuals, jacobian, chi_square, evaluations, converged, reached.first)
 
 
 def _is_negligible(before: float, after: float) -> bool:
@@ -102,12 +103,13 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
     jacobian, low, high = reached.jacobian, objective.low - reached.guess, objective.high - reached.guess
     first, normal = jacobian.T @ reached.residuals, jacobian.T @ jacobian
     size = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
-    damped = normal + np.diag(damping * size**2)
+    damped = normal.copy()
+    damped.flat[:: len(first) + 1] += damping * size**2
     free = ~(((low >= 0.0) & (first > 0.0)) | ((high <= 0.0) & (first < 0.0)))
     step, gradient = np.zeros(len(first)), first
-    while free.any():
+    while count := np.count_nonzero(free):
         root, system, right = size, damped, gradient
-        if not free.all():
+        if count < len(free):
             root, system, right = size[free], damped[free][:, free], gradient[free]
         step[free] = -np.linalg.solve(system / (root[:, None] * root), right / root) / root
         beyond = free & ((step < low) | (step > high))

@@ -11,6 +11,8 @@ states, against sensor noise. Without process noise the gain is zero, and the tw
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import replace
+from functools import cached_property, lru_cache
+from itertools import count
 
 import numpy as np
 
@@ -29,6 +31,7 @@ ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from w
 WHITE_ROUNDING = 2.0  # standard deviations of the noise: rounding to steps up to this size is white noise
 # Standard deviations of the noise: what differs by more are wrong values, no levels of a converter.
 MAX_ADC_STEP = 1000.0
+SHARED_WINDOWS = 4  # of which the noise and a predictor are kept, for other problems of the same window
 MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
 
 
@@ -49,18 +52,19 @@ class Objective:
         """
         twin = problem.twin
         self.kernel = kernel_of(twin)
-        outputs = [window.signals.index(output.name) for output in twin.outputs]
-        self.measured, self.present = window.values.take(outputs, axis=1), ~window.missing.take(outputs, axis=1)
-        self._counts = np.maximum(self.present.sum(axis=0), 1.0)
-        self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
+        self._window, self._base = window, problem.base_model
+        self.measured, self.present, measured = _measurements(window, self._base)
+        counts = self.present.sum(axis=0)
+        self._counts, self.count = np.maximum(counts, 1.0), max(float(counts.sum()), 1.0)  # Measured values
         self._seed = problem.seed + window.index
-        self._base = problem.base_model
+        self._noisier_inputs: list[Array] = []  # Drawn when they are first needed
         self._noisy_inputs = [
             (column, level, np.flatnonzero(~window.missing_in(self._base.inputs[column].name)))
             for column, level in enumerate(problem.input_noise)
             if level
         ]
-        self.noise = self._noise_model(problem, window)
+        levels = problem.noise, problem.steps, problem.input_noise, problem.process_noise
+        self.noise = _noise_model(window, self._base, *levels, problem.window.sample_period)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
@@ -76,7 +80,6 @@ class Objective:
         self._open_loop = problem.open_loop
         limit = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
         self._limits = TRUNCATION * self.noise.outputs, limit
-        measured = np.where(self.present, self.measured, np.nan)
         self.excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
         """Inputs, measurements, gain and sub-steps of the predictor."""
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
@@ -96,10 +99,11 @@ class Objective:
     def set_predictor(self, parameters: Array, initial: Array, substeps: int = 1) -> None:
         """Compute at least ``substeps`` sub-steps, gain and whitening around ``parameters`` (free,) and ``initial``."""
         full = self.parameters(parameters[None])[0]
-        uncorrected = replace(self.excitation, gain=None, substeps=substeps)
+        drive = self.excitation.inputs, self.excitation.grid
+        measured, uncorrected = self.excitation.measured, replace(self.excitation, gain=None, substeps=substeps)
         while True:
-            model = self._innovation_model(full, initial, uncorrected)
-            corrected = replace(uncorrected, gain=model.gain)
+            model = self._innovation_model(full, initial, uncorrected.substeps)
+            corrected = Excitation(*drive, uncorrected.substeps, measured, model.gain)
             needed = self.kernel.substeps(full, initial, corrected, *self._limits)
             if needed <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
@@ -111,15 +115,17 @@ class Objective:
         full = self.parameters(parameters[None])[0]
         return self.kernel.substeps(full, initial, self.excitation, *self._limits) <= self.excitation.substeps
 
-    def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
+    def _innovation_model(self, parameters: Array, initial: Array, substeps: int) -> InnovationModel:
         """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
         twin = self._base
-        if excitation.inputs.shape[1] > len(twin.inputs):
-            excitation = replace(excitation, inputs=excitation.inputs[:, : len(twin.inputs)])
-        parameters, initial = parameters[: len(twin.parameters)], initial[: len(twin.states)]
-        model = kernel_of(twin).predictor(parameters, initial, excitation, self.noise, open_loop=self._open_loop)
+        around = parameters[: len(twin.parameters)].tobytes(), initial[: len(twin.states)].tobytes()
+        model = _predictor(self._window, twin, self.noise, substeps, *around, open_loop=self._open_loop)
         extra = self._states - len(twin.states)
         return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
+
+    @cached_property
+    def _random(self) -> np.random.Generator:
+        return np.random.default_rng(self._seed)
 
     @property
     def whitening(self) -> Array:
@@ -168,14 +174,15 @@ class Objective:
 
         The predictor stays. Each has other noise, and there is no end.
         """
-        random = np.random.default_rng(self._seed)
-        while self._noisy_inputs:
-            inputs = self.excitation.inputs.copy()
-            for column, level, sampled in self._noisy_inputs:
-                hold, errors = self._base.inputs[column].hold, level * random.standard_normal(len(sampled))
-                inputs[:, column] += _held(errors, sampled, self.excitation.grid.offsets, hold)
+        drawn, random = self._noisier_inputs, self._random
+        for number in count() if self._noisy_inputs else ():
+            if number == len(drawn):
+                drawn.append(self.excitation.inputs.copy())
+                for column, level, sampled in self._noisy_inputs:
+                    hold, errors = self._base.inputs[column].hold, level * random.standard_normal(len(sampled))
+                    drawn[-1][:, column] += _held(errors, sampled, self.excitation.grid.offsets, hold)
             noisier = copy(self)
-            noisier.excitation = replace(self.excitation, inputs=inputs)
+            noisier.excitation = replace(self.excitation, inputs=drawn[number])
             yield noisier
 
     def changes_by_input_noise(self, guess: Array, residuals: Array, jacobian: Array) -> Iterator[Array]:
@@ -191,13 +198,15 @@ class Objective:
             yield np.concatenate([slopes - jacobian, (moved - residuals)[:, None]], axis=1)
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
-        parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
+        parameters, initial = self._template.copy(), guess[self.free :]
+        parameters[self._free_columns] = guess[: self.free]
         prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
         with np.errstate(over="ignore", invalid="ignore"):
             errors = (prediction.outputs - self.measured)[..., None]
             residuals = self.kernel.whiten(self.innovation_model, errors, self.present).ravel()
         jacobian = self.kernel.whiten(self.innovation_model, prediction.slopes, self.present)
-        if all(np.vdot(numbers, numbers) <= PENALTY**2 for numbers in (residuals, jacobian)):  # false for NaN
+        limit = PENALTY**2
+        if np.vdot(residuals, residuals) <= limit and np.vdot(jacobian, jacobian) <= limit:  # false for NaN
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
 
@@ -254,21 +263,58 @@ class Objective:
         errors = np.where(self.present, self.measured - predicted, 0.0)
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / self._counts))
 
-    def _noise_model(self, problem: Problem, window: Window) -> NoiseModel:
-        twin = self._base
-        known = problem.steps or (0.0,) * len(twin.outputs)
-        samples = zip(self.measured.T, self.present.T, problem.noise, known, strict=True)
-        rounding = [rounding_variance(values[present], noise, step) for values, present, noise, step in samples]
-        outputs = np.sqrt(np.array(problem.noise) ** 2 + np.array(rounding))
-        states = np.array(problem.process_noise or [0.0] * len(twin.states))
-        inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
-        error = window.bridge_error
-        at_records = held = np.full((window.records, len(inputs)), inputs)
-        if error is not None:
-            columns = [window.signals.index(driven.name) for driven in twin.inputs]
-            at_records = np.sqrt(inputs**2 + error.variance[:, columns])
-            held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
-        return NoiseModel(outputs, at_records, held, states, problem.window.sample_period)
+
+@lru_cache(maxsize=SHARED_WINDOWS)
+def _measurements(window: Window, twin: Definition) -> tuple[Array, Mask, Array]:
+    """Return the outputs (records, outputs), which of them are measured, and the outputs with NaN where not."""
+    outputs = [window.signals.index(output.name) for output in twin.outputs]
+    values, present = window.values.take(outputs, axis=1), ~window.missing.take(outputs, axis=1)
+    return values, present, np.where(present, values, np.nan)
+
+
+@lru_cache(maxsize=SHARED_WINDOWS)
+def _noise_model(  # noqa: PLR0913, PLR0917 - the levels of a problem, by which it is found again
+    window: Window,
+    twin: Definition,
+    noise: tuple[float, ...],
+    steps: tuple[float, ...],
+    input_noise: tuple[float, ...],
+    process_noise: tuple[float, ...],
+    period: float | None,
+) -> NoiseModel:
+    measured, present, _ = _measurements(window, twin)
+    samples = zip(measured.T, present.T, noise, steps or (0.0,) * len(noise), strict=True)
+    rounding = [rounding_variance(values[own], level, step) for values, own, level, step in samples]
+    outputs = np.sqrt(np.array(noise) ** 2 + np.array(rounding))
+    states = np.array(process_noise or [0.0] * len(twin.states))
+    inputs = np.array(input_noise or [0.0] * len(twin.inputs))
+    error = window.bridge_error
+    at_records = held = np.full((window.records, len(inputs)), inputs)
+    if error is not None:
+        columns = [window.signals.index(driven.name) for driven in twin.inputs]
+        at_records = np.sqrt(inputs**2 + error.variance[:, columns])
+        held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
+    return NoiseModel(outputs, at_records, held, states, period)
+
+
+@lru_cache(maxsize=SHARED_WINDOWS)
+def _predictor(  # noqa: PLR0913, PLR0917 - all that it depends on, by which it is found again
+    window: Window,
+    twin: Definition,
+    noise: NoiseModel,
+    substeps: int,
+    parameters: bytes,
+    initial: bytes,
+    *,
+    open_loop: bool,
+) -> InnovationModel:
+    """Return gain and whitening of a ``twin`` without slots; the hypotheses of a search share them.
+
+    ``parameters`` (parameters,) and ``initial`` (states,) are the bytes of arrays.
+    """
+    drive = Excitation(input_matrix(twin, window), window.grid, substeps, _measurements(window, twin)[2])
+    around = np.frombuffer(parameters), np.frombuffer(initial)
+    return kernel_of(twin).predictor(*around, drive, noise, open_loop=open_loop)
 
 
 def _held(values: Array, sampled: Indices, offsets: Array, hold: str) -> Array:

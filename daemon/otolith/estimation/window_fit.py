@@ -109,7 +109,7 @@ class Fit:
         """(free + states,) without trends, for :attr:`objective`."""
         return self.objective.without_trends(self.result.guess)
 
-    @property
+    @cached_property
     def inflation(self) -> float:
         """Factor on standard deviations for a residual larger than the noise; see :func:`inflation_of`."""
         return inflation_of(self.innovations, self.objective.present, self.cost)
@@ -291,6 +291,8 @@ class _BothFits:
     inflation: float
     information: Information
     """Of the window alone."""
+    factors: tuple[Array, Array]
+    """Of the window alone: orthonormal basis and triangular factor of its Jacobian."""
     values: Array
     """(guess,) of the window alone, without the bias by the noise of inputs."""
     evaluations: int
@@ -333,15 +335,16 @@ def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
     alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
     inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
-    root, values = _without_input_noise(objective, alone)
+    basis, factor = np.linalg.qr(alone.jacobian)
+    root, values = _without_input_noise(objective, alone, factor)
     uncertainty = information(root, objective.high - objective.low, inflation)
-    return _BothFits(fitted, alone, inflation, uncertainty, values, evaluations + alone.evaluations)
+    evaluations += alone.evaluations
+    return _BothFits(fitted, alone, inflation, uncertainty, (basis, factor), values, evaluations)
 
 
-def _without_input_noise(objective: Objective, alone: FitResult) -> tuple[Array, Array]:
+def _without_input_noise(objective: Objective, alone: FitResult, root: Array) -> tuple[Array, Array]:
     """Return square-root information and values (guess,) of the window alone, without the bias by noisy inputs."""
     changes = objective.changes_by_input_noise(alone.guess, alone.residuals, alone.jacobian)
-    root = np.asarray(np.linalg.qr(alone.jacobian, mode="r"))
     unbiased, moved = without_input_noise(root, np.zeros(len(root)), changes)
     if unbiased is root:
         return root, alone.guess
@@ -421,7 +424,8 @@ def _trend_response(both: _BothFits) -> Array:
     """Return the least squares fit (free, free), in s, of constant parameters to what trends change in the window."""
     objective, free, rows = both.fit.objective, both.fit.objective.free, len(both.fit.prior.mean)
     width, of_trends = objective.high - objective.low, both.fit.result.jacobian[:-rows, free : 2 * free]
-    response = np.linalg.lstsq(both.alone.jacobian * width, of_trends, rcond=MIN_SINGULAR)[0]
+    basis, factor = both.factors
+    response = np.linalg.lstsq(factor * width, basis.T @ of_trends, rcond=MIN_SINGULAR)[0]
     return np.asarray((width[:, None] * response)[:free])
 
 

@@ -201,6 +201,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     records, events, absent = {}, list[EventDocument](), set[str]()
     shelves = lasting(state.shelves, state.notes, report.window.end)
     for key, observed in observations.items():
+        if key not in state.records and observed.level in (None, Level.OK):  # as most: nothing to carry on
+            continue
         own = observed if key in state.inside else _from_start(observed)
         before = state.records.get(key, ConditionRecord())
         record = _advance(plan, before, own, report)

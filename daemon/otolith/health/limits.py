@@ -34,10 +34,11 @@ class Level(StrEnum):
     @property
     def rank(self) -> int:
         """Position from the least severe to the most severe."""
-        return LEVELS.index(self)
+        return _RANKS[self]
 
 
 LEVELS = tuple(Level)
+_RANKS = {level: rank for rank, level in enumerate(LEVELS)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,8 @@ class ComponentFamily:
     conditions: str  # Working conditions under which machines show it (Table 1)
     domain: str  # Where it is valid, in words
     inputs: frozenset[SourceKind]  # Kinds of source that it may depend on
-    valid: Callable[[SourceRange], bool]  # Whether the window distinguishes the family from others
+    valid: Callable[[SourceRange], bool]
+    """Whether the window distinguishes the family from others, if it also leaves the inner parameter a range."""
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
@@ -125,19 +126,9 @@ def _frequencies(x: SourceRange) -> tuple[float, float]:
     return MIN_PERIODIC_ANGLE / max(x.width, MIN_MAGNITUDE), MAX_ANGLE_PER_RECORD / max(x.step, MIN_MAGNITUDE)
 
 
-def _has_frequencies(x: SourceRange) -> bool:
-    low, high = _frequencies(x)
-    return high > low
-
-
 def _rates(x: SourceRange) -> tuple[float, float]:
     width = max(x.width, MIN_MAGNITUDE)
     return MIN_BEND / width, min(MAX_BEND / width, MAX_EXPONENT / _largest(x))
-
-
-def _has_rates(x: SourceRange) -> bool:
-    low, high = _rates(x)
-    return _varies(x) and high > low
 
 
 def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
@@ -149,11 +140,6 @@ def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
 def _stribeck_speeds(x: SourceRange) -> tuple[float, float]:
     low = max(MIN_STRIBECK_SPEED * _largest(x), HIDDEN_HUMP * x.smallest)
     return low, MAX_STRIBECK_SPEED * _largest(x)
-
-
-def _has_stribeck_speeds(x: SourceRange) -> bool:
-    low, high = _stribeck_speeds(x)
-    return _varies(x) and low < high
 
 
 MOTION = frozenset({SourceKind.PLACE, SourceKind.SPEED, SourceKind.SIGNAL})
@@ -168,10 +154,10 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
                     dissipates=True),
     ComponentFamily("exponential", "a*exp(b*x)", "{a}·exp({b}·{x})",
                     "current leaking, deterioration, wear and tear, corrosion", "everywhere, but for speeds", GROWTH,
-                    _has_rates, RATE),
+                    _varies, RATE),
     ComponentFamily("negative exponential", "a*exp(-b*x)", "{a}·exp(-{b}·{x})",
                     "ageing, degradation, fatigue, crack growth", "everywhere, but for speeds", GROWTH,
-                    _has_rates, RATE),
+                    _varies, RATE),
     ComponentFamily("power", f"a*sign(x)*exp(b*log(Max(absolute(x), {MIN_MAGNITUDE})))", "{a}·{x}^{b}",
                     "hard stops, overloading, mechanical shock", "mirrored for negative inputs", ANY, _varies,
                     InnerParameter("exponent", "1", lambda x: (MIN_POWER, MAX_POWER), 2), dissipates=True),
@@ -180,14 +166,14 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
     ComponentFamily("periodic", "a*sin(b*x + c)", "{a}·sin({b}·{x} {c})",
                     "unbalanced shaft, shaft misalignment, machine unsteadiness",
                     "time, angles and positions: a sine of anything else could fit almost any signal",
-                    frozenset({SourceKind.TIME, SourceKind.PLACE}), _has_frequencies,
+                    frozenset({SourceKind.TIME, SourceKind.PLACE}), lambda x: True,
                     InnerParameter("frequency", "rad/{x}", _frequencies, 0), phases=(0.0, 0.5 * math.pi)),
     ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
                     MOTION, _changes_sign, InnerParameter("transition", "{x}", _coulomb_transitions, 2),
                     threshold_like=True, dissipates=True),
     ComponentFamily("Stribeck", f"a*tanh(x/({COULOMB_TRANSITION}*b))*exp(-(x/b)**2)",
                     "{a}·sign({x})·exp(-({x}/{b})²)", "friction that falls with the speed",
-                    "inputs that come near zero", MOTION, _has_stribeck_speeds,
+                    "inputs that come near zero", MOTION, _varies,
                     InnerParameter("Stribeck speed", "{x}", _stribeck_speeds, 4), threshold_at_rest=True,
                     dissipates=True),
 )  # fmt: skip
