@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from otolith.acquisition.window import Mask, Window, runs_of
+from otolith.estimation.evidence import SIGNIFICANT_DEVIATE
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 from otolith.twin.expressions import names_in, parse
@@ -19,7 +20,6 @@ from otolith_drivers.units import are_of_one_quantity
 MIN_OFF = 5  # records without a command from which on a drive is off
 SWITCHING = 3  # records within which the current of an open bridge ends
 OFF_SHARE = 0.95  # of the records of a stretch whose current is zero within its noise
-OFF_REACH = 4.0  # standard deviations of the noise, within which a current is zero
 MIN_ON_SHARE = 0.25  # of the records of a window: less between two stretches is not estimated from
 
 
@@ -51,9 +51,11 @@ def off_records(problem: Problem, window: Window) -> Mask:
     levels = dict(zip((row.name for row in inputs), problem.input_noise or (0.0,) * len(inputs), strict=True))
     for current, commands in _driven_currents(problem.base_model):
         index = [output.name for output in problem.base_model.outputs].index(current)
-        reach = OFF_REACH * problem.noise[index] + (problem.steps[index] if problem.steps else 0.0)
+        reach = SIGNIFICANT_DEVIATE * problem.noise[index] + (problem.steps[index] if problem.steps else 0.0)
         is_zero = (np.abs(window.readings(current)) <= reach) | window.missing_in(current)
-        without = np.all([np.abs(window.column(name)) <= OFF_REACH * levels[name] for name in commands], axis=0)
+        without = np.all(
+            [np.abs(window.column(name)) <= SIGNIFICANT_DEVIATE * levels[name] for name in commands], axis=0
+        )
         for start, end in runs_of(without):
             begin = _end_of_current(is_zero[start:end])
             if end - start - begin >= MIN_OFF:

@@ -39,7 +39,7 @@ CHANGE_SIGNIFICANCE = 1e-6  # probability of a difference by chance, below which
 MAX_OUTLYING_SHARE = 0.2  # of the windows: more of them are no exceptions
 OUTLYING = 4.75  # standard deviations from which on a window is not one of the machine that the others show
 LAGS = 20  # of the autocorrelation, records
-MIN_RECORDS = 40  # of a window: twice the lags
+MIN_RECORDS = 2 * LAGS  # of a window
 WHITE_SIGNIFICANCE = 1e-3  # probability of a test's result by chance, below which innovations are coloured
 BAND_RATIO = 4.0  # between the ends of a band of the spectrum
 

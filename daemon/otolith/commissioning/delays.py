@@ -11,7 +11,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, with_initial_noise
-from otolith.commissioning.likelihood import FIRST_FITS, FittedWindow, Likelihood, Progress
+from otolith.commissioning.likelihood import FIRST_FITS, MAX_FIRST_COST, FittedWindow, Likelihood, Progress
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
@@ -33,7 +33,6 @@ NEGLIGIBLE_STEP = 0.05  # standard deviations: step of a delay after which the s
 MAX_REFINEMENTS = 2  # of the delays with identified noise levels, and of these without the refined delays
 MAX_UNCERTAINTY = 0.5  # of the largest delay: standard deviation of a delay above which the data show nothing of it
 MIN_RECORDS = 8  # of a window
-MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
 
 UNOBSERVABLE = "its delay cannot be identified: it does not move, or no output depends on it"
 NO_DELAY = "no delay is significant; up to about {:.2g} ms could not be detected"
@@ -190,7 +189,7 @@ class _Search:
         self._windows = [window for window in good if window.records >= MIN_RECORDS]
         starts = [problem.nominal] * len(self._windows)
         point = self._evaluate(np.zeros(len(self.names)), self._windows, starts)
-        used = [at for at, fit in enumerate(point.fits) if fit.cost < MAX_COST]
+        used = [at for at, fit in enumerate(point.fits) if fit.cost < MAX_FIRST_COST]
         self._windows = [self._windows[at] for at in used]
         fits = [point.fits[at] for at in used]
         self._first = _Point(point.delays, fits, self._likelihood.deviance(fits))

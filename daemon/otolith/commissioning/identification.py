@@ -28,6 +28,7 @@ from otolith.commissioning.consistency import (
 )
 from otolith.commissioning.input_noise import InputNoise, input_noise
 from otolith.commissioning.likelihood import (
+    MAX_FIRST_COST,
     Fits,
     FittedWindow,
     Likelihood,
@@ -51,7 +52,6 @@ OBSERVABLE = np.log(2.0)  # increase of the mean log variance of the innovations
 PROCESS_RESOLUTION = 0.125  # decades, of the initial process noise
 MIN_RECORDS = DIFFERENCE_ORDER + 1  # of a window
 MIN_SENSOR_SHARE = 0.02  # of the noise that a signal shows: floor of the sensor's level
-MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
 POOR_FIT = 5.0  # cost of the first window's fit beyond which all of the bounds are searched for a better minimum
 SMALL_PROCESS_SHARE = 1e-3  # of the observable process noise: where inflation begins if the likelihood found none
 MAX_LEFT = 0.5  # of the reduced chi-square that process noise may leave where it cannot make windows consistent
@@ -214,7 +214,7 @@ def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: 
     usable = usable_windows(problem, windows)
     levels = _initial_levels(problem, usable)
     shown, process = levels.signal_noise > 0.0, levels.process
-    fits = [fit for fit in _first_fits(likelihood, levels.values, usable, progress) if fit.cost < MAX_COST]
+    fits = [fit for fit in _first_fits(likelihood, levels.values, usable, progress) if fit.cost < MAX_FIRST_COST]
     if len(fits) < len(windows):
         remarks.append(EXCLUDED.format(len(windows) - len(fits), len(windows)))
     moving = [fit for fit in fits if len(sqrt_information(fit, likelihood.width))]

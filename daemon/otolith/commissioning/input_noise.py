@@ -18,17 +18,15 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
-from otolith.estimation.evidence import Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, SIGNIFICANT_DEVIATE, Elimination
 from otolith.estimation.minimisers import continued
 from otolith.estimation.window_fit import ALONE_STEPS, Fit
 from otolith.twin.definition import Input
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 DRAWS = 16  # of noise for each window of a record, by which the expected correlation is computed
-SIGNIFICANT_SHARE = 3.0  # standard deviations
 SECOND_DIFFERENCE_GAIN = np.sqrt(6.0)  # for white noise
 RUNNING_DRAWS = 4  # of noise for each window of a running twin: other windows have others
-SIGNIFICANT_SUM = 4.0  # standard deviations: the sums are tested after each window
 MIN_SUMMED, SUMMED_EVERY = 4, 8  # windows: least number, and one of so many that is always added
 SUMMED_RATIO = 1.2  # ratio of variances above which windows differ by more than they should: then each is added
 FORGETTING = 0.98  # of the sums, with each window that is added
@@ -74,7 +72,7 @@ class InputNoise:
     @property
     def is_significant(self) -> bool:
         """Whether the innovations show that a part is noise."""
-        return self.share > SIGNIFICANT_SHARE * self.sd
+        return self.share > CHANCE_DEVIATE * self.sd
 
     @property
     def level(self) -> float:
@@ -141,7 +139,7 @@ class InputNoiseSums:
         bounds = input_noise_bounds(fitted.problem, fitted.window).tolist()
         levels = list(fitted.problem.levels)
         for at, (own, bound) in enumerate(zip(self.sums, bounds, strict=False)):
-            noise = float(np.sqrt(own.observed / own.expected)) if own.deviate > SIGNIFICANT_SUM else np.inf
+            noise = float(np.sqrt(own.observed / own.expected)) if own.deviate > SIGNIFICANT_DEVIATE else np.inf
             if noise < MIN_NOISE_FACTOR * bound and own.windows >= MIN_SUMMED:
                 levels[at] = min(noise, bound)
         return None if tuple(levels) == fitted.problem.levels else tuple(levels)
@@ -149,7 +147,7 @@ class InputNoiseSums:
 
 def _limited(own: Correlation) -> Correlation:
     """Return the correlation of one window, observed no larger than if all that it has shown were noise."""
-    most = own.bound**2 * own.expected + SIGNIFICANT_SHARE * float(np.sqrt(own.variance))
+    most = own.bound**2 * own.expected + CHANCE_DEVIATE * float(np.sqrt(own.variance))
     return replace(own, observed=min(own.observed, most))
 
 

@@ -22,6 +22,7 @@ from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
+MAX_FIRST_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
 FIRST_FITS = 3  # of a window; the predictor is remade between them, as its gain depends on the parameters
 DIFFERENCE_STEP = 0.02  # of a variance, for finite differences
 MIN_DIFFERENCE_SHARE = 1e-3  # of the initial variance: below it, the difference step no longer shrinks

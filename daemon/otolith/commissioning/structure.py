@@ -34,7 +34,7 @@ from otolith.discovery.linear_response import (
 )
 from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
-from otolith.estimation.evidence import DECISIVE, Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE, Elimination
 from otolith.estimation.information import initial_prior
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
@@ -45,7 +45,6 @@ from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
 CONFIRMED = 1e-6  # the same of what is adopted
-CHANCE_DEVIATE = 3.0  # standard deviations that count as chance: of χ² of further phases, of a parameter's value
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared

@@ -10,9 +10,10 @@ from otolith.commissioning.constancy import ValueChange
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
-from otolith.estimation.evidence import DECISIVE
+from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE, STRUCTURE
+from otolith.estimation.global_search import LEVELS
 from otolith.estimation.information import QUANTILE
-from otolith.estimation.minimisers import FitResult, gauss_newton
+from otolith.estimation.minimisers import MAX_STEPS, FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay
@@ -20,11 +21,8 @@ from otolith.twin.definition import Parameter
 from otolith_drivers.units import is_one_in_si
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-STAGES = (1.0, 0.1, 0.01)  # of the process noise with which the signals would be a random walk
-STAGE_STEPS, LAST_STEPS = 12, 40  # of Gauss-Newton
+STAGE_STEPS = 12  # of Gauss-Newton
 QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
-MAX_QUIET_COST = 1.5  # RMSE of that fit over the noise, up to which the twin hardly lacks anything
-DIFFERENT = 4.0  # standard deviations between the values of both fits, beyond which noise does not explain it
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
 MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
 WIDER_INTERVAL = 1.5  # times the interval of a parameter that is less than determined: accepted in the next fits
@@ -66,7 +64,7 @@ class OwnValues:
     @property
     def is_explained(self) -> bool:
         """Whether the twin leaves no more than noise where it is hardly corrected."""
-        return self.is_followed and self.quiet_cost <= MAX_QUIET_COST
+        return self.is_followed and self.quiet_cost <= STRUCTURE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +132,7 @@ class ValueSearch:
         found = OwnValues((), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits)
         wide = [name for name in values if QUANTILE * spread[name] > DETERMINED * self._size(name, values[name])]
         spread = {name: max(own, self._beside.get(name, 0.0)) for name, own in spread.items()}
-        differ = [name for name in values if abs(others[name] - values[name]) > DIFFERENT * sd[name]]
+        differ = [name for name in values if abs(others[name] - values[name]) > SIGNIFICANT_DEVIATE * sd[name]]
         if found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
             return replace(found, values=self._values(others, spread))
         faults = tuple(self._contradictions([name for name in wide if name[0] != "_"], values, others))
@@ -147,7 +145,7 @@ class ValueSearch:
         """
         noise = tuple(QUIETER * level for level in stage.problem.process_noise)
         quieter = replace(stage, problem=replace(stage.problem, process_noise=noise))
-        guesses, result, together = self._fit(quieter, LAST_STEPS)
+        guesses, result, together = self._fit(quieter, MAX_STEPS)
         return {name: float(guesses[0][ats[0]]) for name, ats in stage.shared.items()}, together.cost(result)
 
     def _simulated(self, stage: _Stage) -> tuple[dict[str, float], tuple[float, ...]]:
@@ -190,7 +188,7 @@ class ValueSearch:
         stage, cost = self._last.stage, self._last.cost
         self._progress("delays of the signals")
         largest = min(largest_delay(window.grid.length, window.sample_period) for window in self._windows)
-        _, result, together = self._fit(stage, LAST_STEPS, largest)
+        _, result, together = self._fit(stage, MAX_STEPS, largest)
         late = together.delays(result.guess)
         is_shown = np.abs(late).max() < largest and self.gain(cost, together.cost(result)) > DECISIVE
         return late - np.median(late) if is_shown else none
@@ -254,8 +252,8 @@ class ValueSearch:
         parameters = np.array([self._start.get(row.name, row.nominal) for row in problem.free])
         guesses: list[Array] = []
         noise, walk = self._levels()
-        for share in STAGES:
-            self._progress(f"values of {len(shared)} parameters, stage {STAGES.index(share) + 1} of {len(STAGES) + 1}")
+        for share in LEVELS:
+            self._progress(f"values of {len(shared)} parameters, stage {LEVELS.index(share) + 1} of {len(LEVELS) + 1}")
             staged = with_levels(problem, np.concatenate([noise, share * walk]))
             guesses, _, _ = self._fit(_Stage(staged, moved, parameters, guesses), STAGE_STEPS)
             parameters = guesses[0][: len(parameters)]
@@ -264,7 +262,7 @@ class ValueSearch:
             replace(row, nominal=float(value)) for row, value in zip(problem.free, parameters, strict=True)
         ))  # fmt: skip
         there = with_initial_noise(there, self._windows)
-        guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), LAST_STEPS)
+        guesses, result, together = self._fit(_Stage(there, moved, parameters, guesses), MAX_STEPS)
         cost = together.cost(result)
         values = {name: float(guesses[0][ats[0]]) for name, ats in moved.items()}
         sizes = {name: self._size(name, value) for name, value in values.items()}
@@ -324,7 +322,7 @@ class ValueSearch:
     def _excludes_example(self, name: str, value: float, sd: float) -> bool:
         """Whether the data show that a parameter does not have the value of the example, by whatever scale."""
         row = self._problem.free[self._places[name]]
-        scale, far = SharedScale(row), DIFFERENT * sd
+        scale, far = SharedScale(row), SIGNIFICANT_DEVIATE * sd
         number = scale.inside(value)
         return abs(value - row.nominal) > far and abs(number - scale.inside(row.nominal)) > far / scale.slope(number)
 

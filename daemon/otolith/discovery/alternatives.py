@@ -11,6 +11,7 @@ from enum import Enum, StrEnum
 import numpy as np
 
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, delay_score
+from otolith.estimation.evidence import CERTAIN_DEVIATE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem, equation, indices, site_of
 from otolith.estimation.timing import largest_delay
@@ -19,7 +20,6 @@ from otolith_drivers.units import equation_text, unit_text
 
 AGREEING_WINDOWS, PROBABLE = 2, 0.8  # windows that must agree on a cause, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same of a component, which stays in the twin
-MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
 MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MS = 1e3  # ms in a second
 CHANGING, POLLED = "{} changes between its samples", 'write times = "polled" under [signals] {}'
@@ -203,7 +203,7 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
     own = delay_score(fitted, signal)
     before = tracked.delay_information
     information = before + own.information
-    if not information > 0.0 or own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
+    if not information > 0.0 or own.step**2 * before * own.information > CERTAIN_DEVIATE**2 * information:
         return None
     moved = delay + own.information * own.step / information
     limit = largest_delay(fitted.window.grid.length, fitted.window.sample_period)

@@ -10,6 +10,7 @@ from enum import StrEnum
 
 from otolith.discovery.alternatives import (
     ALTERNATIVES,
+    COMPONENT_WINDOWS,
     UPDATES,
     AlternativeRow,
     PosteriorUpdate,
@@ -18,14 +19,12 @@ from otolith.discovery.alternatives import (
 )
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
-from otolith.estimation.evidence import DECISIVE
+from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
-AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
-INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
 FADED_AFTER = 3  # consecutive windows
 BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no hypothesis is accepted
@@ -57,7 +56,7 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     if best.cost > MAX_COST:
         return WindowOutcome(WindowDecision.REFUSED, best)
     if test.is_ambiguous:
-        several = test.counts.since_search >= AMBIGUOUS_WINDOWS
+        several = test.counts.since_search >= COMPONENT_WINDOWS
         return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
     for kind, row in ALTERNATIVES.items():
         if _is_agreed(test, row, kind, is_young=is_young) and (outcome := _outcome(test, row, kind)) is not None:
@@ -232,7 +231,7 @@ def count_fading(adopted: tuple[AdoptedComponent, ...], posterior: Posterior) ->
         if slot is not None:
             index = indices(posterior.problem, slot)[0]
             amplitude, discovered = abs(float(prior.mean[index])), abs(item.component.amplitude)
-            doubt = INSIGNIFICANT * float(prior.sd[index])
+            doubt = CHANCE_DEVIATE * float(prior.sd[index])
             visible = doubt < discovered  # otherwise no window could show it
             effect = amplitude * _left(posterior, slot)
             gone = effect < INSIGNIFICANT_SHARE * discovered or (visible and amplitude < doubt)

@@ -12,6 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
+from otolith.discovery.linear_response import MIN_REMAINDER
 from otolith.estimation.evidence import (
     STRUCTURE,
     Elimination,
@@ -27,7 +28,6 @@ from otolith.estimation.timing import delay_response, delayable
 from otolith.estimation.window_fit import Fit
 
 MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is not tracked
-MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
 
 
@@ -252,7 +252,7 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
     response = np.concatenate([of_window, np.zeros(len(residuals) - len(of_window))])  # that of the prior is zero
     projected = unknowns.left(response)
     size = float(projected @ projected)
-    if size <= MIN_DELAY_SHARE * float(response @ response):
+    if size <= MIN_REMAINDER * float(response @ response):
         return DelayScore(0.0, 0.0, (0.0,) * (2 * free))
     step, information = -float(projected @ residuals) / size, size / fitted.discount
     return DelayScore(step, information, tuple((-unknowns.explaining(response))[: 2 * free].tolist()))

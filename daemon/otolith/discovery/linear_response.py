@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.data_checks import median
-from otolith.estimation.evidence import Elimination, chi_square_left
+from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, Elimination, chi_square_left
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
@@ -24,9 +24,7 @@ from otolith.estimation.window_fit import Fit
 from otolith.twin.components import augmented_model, family_code, sensor_site, sites, sources
 from otolith.twin.kernel import Indices, LinearisedModel, kernel_of
 
-MAX_DIFFERENCE = 10.0  # of χ²: less than that, and a window does not distinguish a component from a parameter
 SAME_DIRECTION = 1.0 - 1e-5  # cosine between the effects of a component and of a parameter that are the same
-MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is noise
 MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of parameters; less is a parameter
 MAX_BLOCK = 1 << 21  # residuals times curves that are computed at once: 16 MB
 PROBES = 16  # random vectors by which the length of a projected response is estimated
@@ -201,7 +199,7 @@ class LinearResponse(ProjectedResponse):
         levels, mean = self.objective.noise.inputs[:, index], float(values.mean())
         noise = float(levels[0]) if self.window.bridge_error is None else median(levels)  # then all are the same
         deviations = values - mean
-        varies = float(deviations @ deviations) > (MIN_INPUT_VARIATION * noise) ** 2 * len(values)
+        varies = float(deviations @ deviations) > (CERTAIN_DEVIATE * noise) ** 2 * len(values)
         return values if varies else np.full(len(values), mean)
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:
@@ -304,7 +302,7 @@ class LinearResponse(ProjectedResponse):
         low = np.array([[parameter.low] for parameter in parameters_of_twin])
         high = np.array([[parameter.high] for parameter in parameters_of_twin])
         within = (low <= now + step) & (now + step <= high)
-        return np.asarray(((cosine > SAME_DIRECTION) & (difference < MAX_DIFFERENCE) & within).any(axis=0))
+        return np.asarray(((cosine > SAME_DIRECTION) & (difference < DECISIVE) & within).any(axis=0))
 
     @property
     def parameters(self) -> dict[str, float]:

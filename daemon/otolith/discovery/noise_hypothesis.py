@@ -16,7 +16,7 @@ from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis, largest_chi_square
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
-from otolith.estimation.evidence import DECISIVE, LogEvidence
+from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE, LogEvidence
 from otolith.estimation.information import MIN_SINGULAR, initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
@@ -25,7 +25,6 @@ from otolith.estimation.window_fit import Fit, fit
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
 MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
 MIN_GAIN = 1.0  # in -2 log likelihood: a step of the levels that would gain less is not taken
-WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
 ROUNDS = 2  # of fitting with the noise and estimating it again
 STEPS = 25  # of Gauss-Newton with the noise
@@ -246,6 +245,6 @@ def is_white(fitted: Fit) -> bool:
         values = innovations[measured]
         power, count = float(values @ values), len(values)
         for lag in range(1, min(WHITE_LAGS, count - 1) + 1):
-            if abs(float(values[lag:] @ values[:-lag])) > WHITE_DEVIATIONS * max(power, count) / np.sqrt(count):
+            if abs(float(values[lag:] @ values[:-lag])) > SIGNIFICANT_DEVIATE * max(power, count) / np.sqrt(count):
                 return False
     return True

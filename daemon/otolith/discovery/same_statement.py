@@ -14,14 +14,13 @@ import numpy as np
 from otolith.acquisition.window import Array
 from otolith.discovery.alternatives import ALTERNATIVES
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, names_of
-from otolith.estimation.evidence import DECISIVE
+from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, amplitude_indices, indices
 from otolith.twin.definition import Definition, Input, Parameter, StateVariable
 from otolith.twin.rates import right_sides
 
-SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 TRIALS, MIN_TRIALS = 64, 8  # random values of states and inputs at which effects are compared; least with any effect
 STEP = 1e-4  # of the width of a parameter's bounds, and of the right side for a component: what gives an effect
@@ -63,7 +62,7 @@ def without_insignificant(tracked: TrackedHypothesis) -> TrackedHypothesis:
         return tracked
     significance = _significance(tracked.posterior)
     weakest = int(np.argmin(significance))
-    if significance[weakest] >= SIGNIFICANT:
+    if significance[weakest] >= SIGNIFICANT_DEVIATE:
         return tracked
     posterior, hypothesis = tracked.posterior.without_slot(weakest), tracked.hypothesis
     if ALTERNATIVES[hypothesis.type].names_components:
@@ -82,10 +81,12 @@ def _equals_null(tracked: TrackedHypothesis, null: TrackedHypothesis) -> bool:
     known, own = ([item.key for item in each.problem.components] for each in (null, tracked))
     if own[: len(known)] != known:  # it states that a component is gone
         return False
-    if any(abs(delay) * np.sqrt(tracked.delay_information) >= SIGNIFICANT for _, delay in tracked.problem.delays):
+    if any(
+        abs(delay) * np.sqrt(tracked.delay_information) >= SIGNIFICANT_DEVIATE for _, delay in tracked.problem.delays
+    ):
         return False
     added = _significance(tracked.posterior)[len(known) :]
-    return bool((added < SIGNIFICANT).all() and (_shifts(tracked, null) < SIGNIFICANT).all())
+    return bool((added < SIGNIFICANT_DEVIATE).all() and (_shifts(tracked, null) < SIGNIFICANT_DEVIATE).all())
 
 
 def _shifts(tracked: TrackedHypothesis, null: TrackedHypothesis) -> Array:

@@ -43,7 +43,7 @@ from otolith.discovery.screening import (
     linearised,
     screen_fit,
 )
-from otolith.estimation.evidence import DECISIVE, discount, is_explained
+from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, discount, is_explained
 from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.posterior import Posterior
@@ -57,7 +57,6 @@ ROUNDS, STEPS_OF_ROUND = 5, 5  # of Gauss-Newton for a hypothesis
 FAR_WORSE = 10.0  # times the least χ² of all candidates: one that leaves more after a round is not fitted further
 PARTS = 8  # of a window, fitted one after another to find an onset
 FAR_OFF = 20.0  # squared innovation in units of its variance: one record in a hundred thousand
-EXPECTED_SPREAD = 5.0  # standard deviations of χ² up to which a part of a window is as predicted
 MIN_RECORDS_AFTER = 60  # measured records after an onset from which its cause can be identified
 MAX_LATE, MIN_LATE_SHARE = 3, 0.1  # signals whose delays are tried, and their least share of the best gain
 DELAY_STEPS = 4  # of Gauss-Newton for a delay
@@ -459,7 +458,7 @@ def _is_explained(fitted: list[FittedHypothesis]) -> bool:
 
 def _leaves_noise(fitted: FittedHypothesis) -> bool:
     count = fitted.fit.count
-    return bool(fitted.unexplained <= count + EXPECTED_SPREAD * np.sqrt(2.0 * count))
+    return bool(fitted.unexplained <= count + CERTAIN_DEVIATE * np.sqrt(2.0 * count))
 
 
 def find_onset(predicted: Posterior, window: Window) -> int:

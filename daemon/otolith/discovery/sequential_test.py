@@ -41,6 +41,7 @@ from otolith.estimation.evidence import (
     likelihood_ratios,
     log_determinant,
 )
+from otolith.estimation.imm_filter import MAX_PRECISION
 from otolith.estimation.information import QUANTILE, Evidence, Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -49,14 +50,13 @@ from otolith.estimation.window_fit import Fit
 MAX_HYPOTHESES = 7  # that are tracked after a search
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
-MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
+MAX_TOTAL_DEVIANCE = 3.0 * MAX_WINDOW_EVIDENCE  # in -2 log evidence: a hypothesis can return when things change
 RESOLVED_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
 PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
 MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
 WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
-MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +93,7 @@ def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evide
     if hypothesis.type is FaultType.NOTHING:
         return True
     relative = np.abs(evidence.sqrt_information) * predicted.prior().sd
-    return bool((relative < MAX_GAIN_OF_INFORMATION).all())  # also false for not-a-number
+    return bool((relative < MAX_PRECISION).all())  # also false for not-a-number
 
 
 @dataclass(frozen=True, slots=True)

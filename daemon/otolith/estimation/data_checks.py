@@ -42,13 +42,12 @@ MAX_RECORDS = 30_000  # that are estimated from: a search for what the twin lack
 MAX_VALUE = 1e12  # magnitude of a value, in the unit of its signal
 SPIKE_HEIGHT = 12.0  # times the usual second difference of the channel: least height of a spike
 SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from that of a spike, which is a half at equal steps
-MAX_SPIKE_SHARE = 0.05  # share of records above which the channel is rejected
+MAX_FAULTY_SHARE = 0.05  # share of records above which the channel is rejected
 MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 SECOND_DIFFERENCE_SD = 1.2247  # standard deviation of the second difference of unit noise, the root of 3/2
 DIFFERENCE_ORDER = 4  # differences of this order remove what a cubic follows over five records
 DIFFERENCE_GAIN = np.sqrt(70.0)  # of white noise by these differences: √(1² + 4² + 6² + 4² + 1²)
 MIN_FROZEN_RUN = 5  # records of one value
-MAX_FROZEN_SHARE = 0.05  # share of records above which the channel is rejected
 FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
 FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
 RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be distinguished from motion over coarse steps
@@ -155,7 +154,7 @@ def drop_spikes(
         is_even = window.grid.period is not None and len(present) == window.records
         is_spike = spike_records(window.values[present, column], level, None if is_even else times[present])
         count = int(is_spike.sum())
-        if count > MAX_SPIKE_SHARE * len(present):
+        if count > MAX_FAULTY_SHARE * len(present):
             text = f"{name} spikes in {count} of {len(present)} records"
             faulty.append(FaultySensor(name, text, _turned_off(name, Check.SPIKES)))
         elif count:
@@ -288,7 +287,7 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
     for channel in _checked_channels(predicted, window):
         present = channel.present
         runs = _constant_runs(channel.values, present)
-        is_long = _samples_in(runs) > MAX_FROZEN_SHARE * len(present)
+        is_long = _samples_in(runs) > MAX_FAULTY_SHARE * len(present)
         if is_long and (run := _frozen_run(channel, runs)) is not None:
             setting = _turned_off(channel.name, Check.FROZEN)
             faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), setting))
@@ -410,7 +409,7 @@ def _frozen_run(channel: _Channel, runs: list[Indices]) -> _FrozenRun | None:
     if sensor.renewed:
         least, times = RENEWED_DISTANCES * sensor.renewed, channel.window.grid.offsets
         moving = [run for run in moving if distance(prediction, times, run) > least]
-    if _samples_in(moving) <= MAX_FROZEN_SHARE * len(values):
+    if _samples_in(moving) <= MAX_FAULTY_SHARE * len(values):
         return None
     rounding = _samples_in(runs) * 0.25 * step**2 / (noise**2 + step**2 / 12.0)
     if sensor.dead_band:

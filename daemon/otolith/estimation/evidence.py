@@ -27,6 +27,10 @@ from otolith.acquisition.window import Array
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
 LEVEL_ERROR = 1.235  # factor by which the noise may be larger than stated
 CHANCE = 1e-9  # probability of what noise alone does not do
+# Standard deviations of what is normal if only noise is at work:
+CHANCE_DEVIATE = 3.0  # within them it counts as chance; 0.3 % lie beyond
+SIGNIFICANT_DEVIATE = 4.0  # beyond them it is no chance, also of many tests in a row: 0.006 %
+CERTAIN_DEVIATE = 5.0  # no chance reaches them: 6e-7
 EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
 ROUNDING = 1e-12  # share of a limit up to which it is computed
 STRUCTURE = 1.5  # RMSE over the noise, with the correlation of what is left, above which that is more than noise

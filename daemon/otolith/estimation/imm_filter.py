@@ -24,7 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
-from otolith.estimation.evidence import chi_square_limit, likelihood_ratios, log_determinant
+from otolith.estimation.evidence import (
+    CERTAIN_DEVIATE,
+    CHANCE_DEVIATE,
+    chi_square_limit,
+    likelihood_ratios,
+    log_determinant,
+)
 from otolith.estimation.information import Evidence
 
 # 1/s^1.5: process noise of a trend, relative to the parameter; the last one of a parameter that is constant
@@ -43,7 +49,6 @@ UNKNOWN_AWAY = 86_400.0  # s: what a time that no clock measured counts as, betw
 MAX_GAP = 1e7  # s between windows: the modes are stationary by then
 VARIANCE_RATIO_GAIN = 0.1  # share of the newest window in the variance ratio
 MAX_VARIANCE_RATIO = 1e4
-MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no further; also the unit of inflate_variance
 MAX_PRECISION = 1e7  # of a window: prior standard deviations over its own, in the direction of which it states most
 SHIFT_REFERENCE = 1.0  # standard deviations: a window that shifts a parameter by less is evidence against a change
 LARGEST_SHARE = 0.6  # of the limit that one window adds at most: a wrong window alone does not reach it
@@ -51,7 +56,6 @@ WINDOWS_PER_ALARM = 3e4  # healthy windows in which one of all sums exceeds its 
 LEAST_SUMS = 4  # for which the limit is computed: of one parameter it is that of two
 OVERSHOOT = 1.166  # standard deviations by which a sum exceeds its limit, twice: 2 · 0.583
 SHIFTED_ALONG = 0.5  # of the limit: sum of a parameter that has been shifted along with another
-MAX_INFLATION = 25.0  # largest factor by which one contradictory window raises the variance ratio
 
 Levels = NDArray[np.int64]
 
@@ -207,7 +211,7 @@ class Innovation:
 
         ``reduced_chi_square`` is that of the window under the null hypothesis.
         """
-        factor = float(np.clip(reduced_chi_square / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
+        factor = float(np.clip(reduced_chi_square / CHANCE_DEVIATE**2, 1.0, CERTAIN_DEVIATE**2))
         prediction = replace(self.prediction, variance_ratio=self.prediction.variance_ratio * factor)
         return innovation_of(prediction, self.evidence)
 
@@ -292,7 +296,7 @@ def _limited(evidence: Evidence, sd: Array) -> Evidence:
 
 
 def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:
-    change = 1.0 + VARIANCE_RATIO_GAIN * (min(nis_per_degree, MAX_NIS_PER_DEGREE) - 1.0)
+    change = 1.0 + VARIANCE_RATIO_GAIN * (min(nis_per_degree, CHANCE_DEVIATE**2) - 1.0)
     return min(max(variance_ratio * change, 1.0), MAX_VARIANCE_RATIO)
 
 

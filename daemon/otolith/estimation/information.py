@@ -20,7 +20,7 @@ from itertools import islice
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
-from otolith.estimation.evidence import Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -32,14 +32,12 @@ MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not ob
 MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: with a wider interval it is not known whether the value exceeds the bound
-PRESSED = 3.0  # standard deviations by which a step without bounds must pass a bound: the value is beyond it
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
 NOISE_DRAWS = 8  # of the noise of inputs, by which its bias is estimated
 NEGLIGIBLE_BIAS = 0.02  # standard deviations of a window: a smaller bias is not corrected
 MIN_KEPT_INFORMATION = 0.5  # share of the information of a direction that is not by the noise of inputs; less is noise
 INFORMATION_OF_NOISE = 0.01  # share of the information of a direction that noise has determined: far less than stated
-CORRELATED = 3.0  # standard deviations of autocovariances of white noise: what is smaller is chance
 WIDEN_BOUNDS = "widen the bounds in [parameters], or check the equations of the twin"
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
@@ -178,13 +176,13 @@ def _long_run_variances(series: Array, expected: float) -> list[float]:
 
     White noise of the variance ``expected`` has no autocovariances, and n values of it show only chance: a variance
     with the relative standard deviation √(2/n), and sums of m autocovariances with √(m/n) (M. S. Bartlett, 1946). What
-    lies within ``CORRELATED`` of these is chance; what is larger shrinks as by the positive-part rule (W. James, C.
+    lies within ``CHANCE_DEVIATE`` of these is chance; what is larger shrinks as by the positive-part rule (W. James, C.
     Stein, 1961). Lags of 1, 2 to 3, 4 to 7 and so on are summed. A negative sum ends the correlation (initial positive
-    sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CORRELATED`` it does so by degrees.
+    sequence: C. J. Geyer, Statistical Science 7, 1992); up to ``CHANCE_DEVIATE`` it does so by degrees.
     """
     records = series.shape[1]
     variance = np.array([own @ own for own in series]) / max(records, 1)
-    by_chance, lags = CORRELATED * variance / np.sqrt(max(records, 1)), int(MAX_LAG * records)
+    by_chance, lags = CHANCE_DEVIATE * variance / np.sqrt(max(records, 1)), int(MAX_LAG * records)
     with np.errstate(divide="ignore", invalid="ignore"):  # of series that are zero, or not finite
         long_run = np.minimum(variance, expected) + _beyond(variance - expected, np.sqrt(2.0) * by_chance)
         if lags >= 2:
@@ -250,7 +248,7 @@ def classify(
 ) -> tuple[Identifiability, str]:
     """Return the identifiability of parameter ``index``, and the reason as a sentence."""
     reach = QUANTILE * uncertainty.sd[index]
-    if target.at_bound and (reach <= PUSHED * target.half_width or target.pressure > PRESSED):
+    if target.at_bound and (reach <= PUSHED * target.half_width or target.pressure > CHANCE_DEVIATE):
         return Identifiability.AT_BOUND, at_its_bound(target.value, target.unit)
     if reach <= target.half_width:
         return Identifiability.DETERMINED, ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.evidence import discount, is_explained
+from otolith.estimation.evidence import CERTAIN_DEVIATE, CHANCE_DEVIATE, discount, is_explained
 from otolith.estimation.global_search import search_window
 from otolith.estimation.information import (
     MIN_SINGULAR,
@@ -42,8 +42,6 @@ AT_BOUND = 1e-4  # share of the width of the bounds
 UNINFORMATIVE = 0.25  # share of the width of the bounds: standard deviation of a parameter that a window leaves open
 ALONE_STEPS = 12  # of Gauss-Newton for the window alone, which starts at the fit under the prior
 LOCAL_MINIMUM = 0.5  # ratio of χ² between two fits under one prior below which the worse one is a local minimum
-DISTINCT = 5.0  # standard deviations between two different results
-EQUALLY_GOOD = 9.0  # difference in χ² between two explanations that are equally good
 MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named
 
 
@@ -382,9 +380,9 @@ def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
     evaluations += from_search.result.evaluations + from_prediction.result.evaluations
     after = _fit_alone(chosen, evaluations)
     distance = np.abs(from_search.parameters - from_prediction.parameters)
-    if not (distance > DISTINCT * both.information.sd[: len(distance)]).any():
+    if not (distance > CERTAIN_DEVIATE * both.information.sd[: len(distance)]).any():
         outcome = Outcome.AGREED
-    elif abs(from_search.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * after.discount:
+    elif abs(from_search.chi_square - from_prediction.chi_square) <= CHANCE_DEVIATE**2 * after.discount:
         outcome = Outcome.AMBIGUOUS
     else:
         found = Outcome.SEARCH_WAS_BETTER if minimum.has_repeated else Outcome.UNREPEATED
@@ -416,7 +414,7 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         generations=generations,
         evaluations=both.evaluations,
         trend_response=_trend_response(both),
-        drifts=both.alone.chi_square > both.fit.window_chi_square + EQUALLY_GOOD * both.discount,
+        drifts=both.alone.chi_square > both.fit.window_chi_square + CHANCE_DEVIATE**2 * both.discount,
     )
 
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from otolith.discovery.alternatives import WindowDecision
-from otolith.discovery.decision import INSIGNIFICANT, Approval
+from otolith.discovery.decision import Approval
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
+from otolith.estimation.evidence import CHANCE_DEVIATE
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import COMMAND, FindingFeatures, MonitoringPlan, matching, severity
 from otolith.health.limits import MACHINE, Coldness, Level, Limit, MonitoredQuantity, coldness_after, probability_beyond
@@ -426,7 +427,7 @@ def _of_component(
     is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING
     if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
         level, limit = quantity.level(size, amplitude.sd, *_held(key, before, past))
-    elif size > INSIGNIFICANT * amplitude.sd and not is_expected:
+    elif size > CHANCE_DEVIATE * amplitude.sd and not is_expected:
         level = severity(plan.rules, features)
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
     beside = f", {_beside(limit, size, amplitude.unit, plan.texts)}" if limit else ""
