@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.commissioning.consistency import MIN_REGIME
 from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
 from otolith.estimation.evidence import CHANCE_DEVIATE, SIGNIFICANT_DEVIATE, Elimination
@@ -27,7 +28,7 @@ from otolith.twin.definition import Input
 DRAWS = 16  # of noise for each window of a record, by which the expected correlation is computed
 SECOND_DIFFERENCE_GAIN = np.sqrt(6.0)  # for white noise
 RUNNING_DRAWS = 4  # of noise for each window of a running twin: other windows have others
-MIN_SUMMED, SUMMED_EVERY = 4, 8  # windows: least number, and one of so many that is always added
+SUMMED_EVERY = 8  # windows, of which one is always added
 SUMMED_RATIO = 1.2  # ratio of variances above which windows differ by more than they should: then each is added
 FORGETTING = 0.98  # of the sums, with each window that is added
 RISEN = 3.0  # times the largest changes before: the sums begin again, as noise may have begun
@@ -140,7 +141,7 @@ class InputNoiseSums:
         levels = list(fitted.problem.levels)
         for at, (own, bound) in enumerate(zip(self.sums, bounds, strict=False)):
             noise = float(np.sqrt(own.observed / own.expected)) if own.deviate > SIGNIFICANT_DEVIATE else np.inf
-            if noise < MIN_NOISE_FACTOR * bound and own.windows >= MIN_SUMMED:
+            if noise < MIN_NOISE_FACTOR * bound and own.windows >= MIN_REGIME:
                 levels[at] = min(noise, bound)
         return None if tuple(levels) == fitted.problem.levels else tuple(levels)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.commissioning.consistency import regimes, sqrt_information
+from otolith.commissioning.consistency import MIN_REGIME, regimes, sqrt_information
 from otolith.commissioning.identification import IdentifiedNoise, usable_windows
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
 from otolith.discovery.candidate_forms import CandidateForm
@@ -42,7 +42,6 @@ from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
 CONFIRMED = 1e-6  # the same of what is adopted
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
@@ -259,7 +258,7 @@ def remaining_structure(
     ``noise`` has been identified from these windows. If the machine changes in them, the longest part between changes
     is used, without the windows in which they may fall.
     """
-    if noise.windows < MIN_WINDOWS or problem.components:
+    if noise.windows < MIN_REGIME or problem.components:
         return []
     likelihood, levels = Likelihood(problem), np.array(noise.before_inflation)
     fits: list[FittedWindow] = []
@@ -270,7 +269,7 @@ def remaining_structure(
     parts = regimes([one for one in fits if one.is_explained], noise.changes)
     inner = [part[at > 0 : len(part) - (at < len(parts) - 1)] for at, part in enumerate(parts)]
     fits = max(inner, key=len, default=[])
-    if len(fits) < MIN_WINDOWS:
+    if len(fits) < MIN_REGIME:
         return []
     progress("structure of all windows")
     pooled = PooledResponse(_at_common_parameters(with_levels(problem, levels), fits, likelihood.width))
@@ -400,8 +399,8 @@ class PooledWindows:
     """The last windows that updated the filter and showed nothing that the twin lacks."""
 
     windows: Starts = ()
-    pause: int = MIN_WINDOWS  # Windows until the next search
-    next_pause: int = MIN_WINDOWS  # The same after it
+    pause: int = MIN_REGIME  # Windows until the next search
+    next_pause: int = MIN_REGIME  # The same after it
     shown: Structure | None = None  # By the last search
     confirmed: Structure | None = None  # By the last two: it is to be adopted
 
@@ -422,7 +421,7 @@ class PooledWindows:
         windows = (*self.windows, start)[-MAX_WINDOWS:]
         while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
             windows = windows[1:]
-        if pause > 0 or len(windows) < MIN_WINDOWS:
+        if pause > 0 or len(windows) < MIN_REGIME:
             return replace(self, windows=windows, pause=pause)
         shown, before = lacking_component(problem, windows), self.shown
         if shown is not None and before is not None and shown.component.key == before.component.key:

@@ -26,7 +26,6 @@ from otolith.estimation.problem import Component, indices, site_of, slot_of
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude, below which it is not seen either
-FADED_AFTER = 3  # consecutive windows
 BEYOND_BOUNDS = 3.0  # times the bounds of a positive parameter: beyond it no hypothesis is accepted
 
 
@@ -176,7 +175,7 @@ class AdoptedComponent:
     @property
     def has_faded(self) -> bool:
         """Whether it may leave the twin."""
-        return self.fading >= FADED_AFTER
+        return self.fading >= COMPONENT_WINDOWS
 
 
 def adopt(

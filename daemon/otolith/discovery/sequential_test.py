@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.alternatives import ALTERNATIVES
+from otolith.discovery.alternatives import AGREEING_WINDOWS, ALTERNATIVES, COMPONENT_WINDOWS
 from otolith.discovery.hypotheses import (
     MAX_DEVIANCE,
     FaultHypothesis,
@@ -51,8 +51,6 @@ MAX_HYPOTHESES = 7  # that are tracked after a search
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 3.0 * MAX_WINDOW_EVIDENCE  # in -2 log evidence: a hypothesis can return when things change
-RESOLVED_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
-PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
 MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
@@ -149,7 +147,7 @@ class WindowCounts:
     tested: int = 1  # Since the test was opened; hypotheses that a later search added are younger
     leading: int = 1  # In a row with the same best hypothesis; of a component, since it last left structure
     since_search: int = 1  # Since a hypothesis of a new search took the lead
-    resolved: int = RESOLVED_WINDOWS  # In a row after which one cause explained all windows best
+    resolved: int = AGREEING_WINDOWS  # In a row after which one cause explained all windows best
     expected: int = 0  # In a row that the filter expected, and that did not confirm the test
 
     def after(self, before: TrackedHypothesis, best: TrackedHypothesis, *, is_resolved: bool) -> "WindowCounts":
@@ -203,7 +201,7 @@ class SequentialTest:
     @property
     def is_ambiguous(self) -> bool:
         """Whether hypotheses of several causes explain the windows equally, or did so one window before."""
-        return self.counts.resolved < RESOLVED_WINDOWS or self.has_equal_causes
+        return self.counts.resolved < AGREEING_WINDOWS or self.has_equal_causes
 
     @property
     def explains_window(self) -> bool:
@@ -338,7 +336,7 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     tracked, deviances = _updated(steps)
     if not tracked:
         return test
-    if test.counts.tested >= PRUNED_AFTER:
+    if test.counts.tested >= COMPONENT_WINDOWS:
         tracked = prune(tracked, deviances)
     tracked = without_repetitions(tracked, test.problem)
     evidence = test.filter_evidence.worse_by(-min(item.deviance for item in tracked))
