@@ -21,7 +21,7 @@ from otolith.fmu_twin import VARIABLES, Variables
 from otolith.health.diagnosis import OwnRule
 from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
-from otolith.outlet_tables import MachineOutletsTable
+from otolith.outlet_tables import OutletsTable
 from otolith.twin.definition import Definition
 from otolith.twin.language import OwnFigureTable
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
@@ -299,7 +299,7 @@ class MachineFile(StrictModel):
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
     evidence: EvidenceTable = EvidenceTable()
-    outlets: MachineOutletsTable = MachineOutletsTable()
+    outlets: OutletsTable = OutletsTable()
 
     @property
     def drivers(self) -> tuple[dict[str, Any], ...]:

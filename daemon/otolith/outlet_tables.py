@@ -192,7 +192,7 @@ class HttpTable(StrictModel):
 
 
 class PrometheusOutlet(HttpTable):
-    """``[outlets.prometheus]`` of a machine file: ``/metrics`` and ``/healthz``, which a site has in any case."""
+    """``[outlets.prometheus]``: ``/metrics`` and ``/healthz`` at an address of their own."""
 
     listen: Address = "127.0.0.1:8421"
     per_hour: ClassVar[int] = 0  # It tells no notices
@@ -204,19 +204,14 @@ class PrometheusOutlet(HttpTable):
 
 
 class OutletsTable(StrictModel):
-    """``[outlets]``: each table is one outlet. ``/metrics`` for Prometheus is always there."""
+    """``[outlets]``: each table is one outlet."""
 
     mqtt: MqttOutlet | None = None
     sparkplug: SparkplugOutlet | None = None
     webhook: WebhookOutlet | None = None
     mail: MailOutlet | None = None
     opcua: OpcuaOutlet | None = None
-
-
-class MachineOutletsTable(OutletsTable):
-    """``[outlets]`` of a machine file."""
-
-    prometheus: PrometheusOutlet | None = None
+    prometheus: PrometheusOutlet | None = None  # A site answers scrapes at the address of its pages, too
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,7 +239,7 @@ class MachineOutlets:
     site: str
     machine: str
     file: Path  # That has the table
-    table: MachineOutletsTable
+    table: OutletsTable
 
     @property
     def key(self) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from otolith.machine_file import EvidenceTable, HistoryTable, MachineFile, RecordingTable, ZenohTable
-from otolith.outlet_tables import MachineOutletsTable
+from otolith.outlet_tables import OutletsTable
 from otolith_drivers.config_files import StrictModel, expect, parse, read, validate
 
 SERVICE_FILE = "service.toml"
@@ -33,7 +33,7 @@ class ServiceFile(StrictModel):
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
     evidence: EvidenceTable = EvidenceTable()
-    outlets: MachineOutletsTable = MachineOutletsTable()
+    outlets: OutletsTable = OutletsTable()
 
 
 TABLES = tuple(name for name in ServiceFile.model_fields if name in MachineFile.model_fields)

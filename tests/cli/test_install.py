@@ -15,7 +15,7 @@ from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
 from otolith.cli.operation.install import HALL_UNIT, UNIT, _commands, _run, drop_in, named_files
 from otolith.machine import load_machine
-from otolith.outlet_tables import MachineOutletsTable
+from otolith.outlet_tables import OutletsTable
 from otolith_drivers.canbus import bus as can_bus
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.conftest import EXAMPLES
@@ -395,7 +395,7 @@ def test_the_drop_in_allows_what_the_file_names() -> None:
     ],
 )
 def test_the_service_reaches_where_its_outlets_pass_on_to(outlets: dict[str, Any], allowed: list[str]) -> None:
-    table = MachineOutletsTable.model_validate(outlets)
+    table = OutletsTable.model_validate(outlets)
     driver = {"type": "can", "channel": "can0"}
     lines = drop_in("press", [driver], ("local",), (), networks=(), outlets=[table]).splitlines()
     assert "RestrictAddressFamilies=AF_UNIX AF_CAN AF_INET AF_INET6" in lines

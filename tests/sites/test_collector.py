@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from otolith.site import collector as collector_module
 from otolith.site.app import SitePages
 from otolith.site.collector import Collector
 from otolith.site.past import MAX_EVENTS, PastQuery, past_of
+from otolith.site.serving.scrapes import Scrapes
 from otolith.site.settings import SiteFile
 from tests.sites.machines import daemons, own_endpoint, raised, report_of, sent
 from tests.storage.histories import MACHINE, SITE
@@ -40,9 +42,9 @@ def test_a_wall_clock_that_is_set_makes_nobody_silent(
     true, end = time.time, time.time()
     collector._take(arrival(1, end), is_past=False)
     monkeypatch.setattr(time, "time", lambda: true() + jump)
-    pages = SitePages(collector, SiteFile())
+    pages, scrapes = SitePages(collector, SiteFile()), Scrapes(collector, (), ThreadPoolExecutor(1))
     assert pages._shown("en").counts[Level.OK] == 1
-    assert b"otolith_machine_up{" in pages._exposition()[0]
+    assert b"otolith_machine_up{" in scrapes._written()
     collector._take(arrival(2, end + 2.0), is_past=False)
     assert pages._shown("en").counts[Level.OK] == 1
 

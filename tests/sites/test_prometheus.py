@@ -19,7 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from otolith.health.limits import Level
 from otolith.health.schema import CostDocument, DriverDocument
-from otolith.outlet_tables import MachineOutletsTable, OutletsTable
+from otolith.outlet_tables import OutletsTable
 from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
 from otolith.site.metrics import Metrics
 from otolith.site.outlets.base import OutletStatus
@@ -127,8 +127,8 @@ def test_the_example_of_a_site_is_one() -> None:
     SiteFile.model_validate(tomllib.loads(text))
     whole = re.sub(r"^# (?=[\[\w]+(?: =|\.|\]))", "", text, flags=re.MULTILINE)
     every = SiteFile.model_validate(tomllib.loads(whole))
-    assert all(getattr(every.outlets, name) is not None for name in OutletsTable.model_fields)
-    assert set(MachineOutletsTable.model_fields) == set(OUTLETS)
+    assert all(getattr(every.outlets, name) is not None for name in OUTLETS)
+    assert set(OutletsTable.model_fields) == set(OUTLETS)
 
 
 def test_panels_of_the_dashboard_cover_no_other_and_ask_the_chosen_source() -> None:

@@ -34,7 +34,7 @@ def site(file: Path | None, verbose: bool) -> int:
         raise ServiceError(f"{', '.join(lacking)} is missing: {installation_of('site')}")
     from otolith.site.access.users import access_of
     from otolith.site.collector import Collector
-    from otolith.site.outlets.base import OutletSetup
+    from otolith.site.outlets.base import OutletSetup, OutletStatus
     from otolith.site.outlets.table import runners_of
     from otolith.site.server import run_site
     from otolith.site.settings import SiteFile, load_site
@@ -45,8 +45,11 @@ def site(file: Path | None, verbose: bool) -> int:
         settings, source = (SiteFile(), None) if file is None else load_site(file)
         access = access_of(settings, folder)
         collector = Collector(settings.connection(folder), settings.machines)
-        setup = OutletSetup(folder, settings.title, settings.language, settings.timezone)
+        statuses = list[OutletStatus]()
+        own = settings.title, settings.language, settings.timezone
+        setup = OutletSetup(folder, *own, known=collector, statuses=statuses)
         outlets = runners_of(settings.outlets, setup, collector, source)
+        statuses += (outlet.status for outlet in outlets)
     except ConfigurationError as error:
         error.exit_code = os.EX_CONFIG  # as 'otolith run', so that systemd does not start it again
         raise

@@ -27,19 +27,19 @@ from otolith.site.compare import peers, poor_data, week
 from otolith.site.daemons import certificates, own_certificate, versions
 from otolith.site.hall import PAGES, Filter, Hall, Shown
 from otolith.site.known import KnownMachine
-from otolith.site.metrics import CONTENT_TYPE, Metrics
 from otolith.site.outlets.base import OutletStatus
 from otolith.site.past import FIRST_SPAN, SPANS
 from otolith.site.serving.live import Live, Places
 from otolith.site.serving.pace import Fresh, Turns
 from otolith.site.serving.past_pages import PastPages
 from otolith.site.serving.pieces import Pieces
+from otolith.site.serving.scrapes import Scrapes
 from otolith.site.settings import OWN_HOSTS, SiteFile
 from otolith.site.words import accepted, words_in
 from otolith_drivers.outside_text import visible
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
-MAX_AGE = 0.5  # s of the hall, of metrics and of the health that are given to several who ask
+MAX_AGE = 0.5  # s of the hall and of the health that are given to several who ask
 MAX_COMPARISON_AGE = 5.0  # s of a comparison
 REFRESH = 30  # s after which a browser asks for the page of a machine again
 BUSY_REFRESH = 5  # s after which it asks again if many look at the past
@@ -155,7 +155,7 @@ class SitePages:
         """Without ``orders`` nobody may send commands."""
         self._collector, self._settings, self._outlets, self._orders = collector, settings, outlets, orders
         self._sending = ThreadPoolExecutor(MAX_SENDING, "send-command")
-        self._hall, self._scrape = Hall(collector.knowledge, settings.timezone), Metrics(collector.knowledge)
+        self._hall = Hall(collector.knowledge, settings.timezone)
         self._live, self._turns = Places(), Turns()
         self._past = PastPages(collector, settings.timezone)
         pages, scrapes = (ThreadPoolExecutor(1, f"make-{name}") for name in ("pages", "metrics"))
@@ -163,7 +163,7 @@ class SitePages:
         self._comparisons = {
             each: Fresh(partial(self._compared, each), MAX_COMPARISON_AGE, pages) for each in LANGUAGES
         }
-        self._metrics = Fresh(self._exposition, MAX_AGE, scrapes)
+        self._scrapes = Scrapes(collector, self._outlets, scrapes)
         self._health = Fresh(self._status, MAX_AGE, scrapes)
         self._started = time.time()
 
@@ -172,7 +172,7 @@ class SitePages:
         pages = {"/": self._show_hall, "/compare": self._show_comparison, "/live": self._show_live,
                  "/machine/{site}/{machine}": self._show_machine}  # fmt: skip
         routes = [
-            Route("/metrics", self._show_metrics), Route("/healthz", self._show_health),
+            Route("/metrics", self._scrapes.answer), Route("/healthz", self._show_health),
             *(Route(path, self._in_turn(show)) for path, show in pages.items()),
             *(Route(f"/{name}", self._in_turn(_static(name, kind))) for name, kind in STATIC.items()),
             Route(COMMAND, self._in_turn(self._take_order), methods=["POST"]),
@@ -287,13 +287,6 @@ class SitePages:
         own = {"text": words_in(language)[word], "here": "", "language": language, "refused": {}}
         page = PAGES.get_template("message.html").render(own, **self._frame(language))
         return HTMLResponse(page, status, headers)
-
-    def _exposition(self) -> list[bytes]:
-        with self._collector.lock:
-            return [self._scrape.exposition(self._collector.dropped, self._outlets, time.monotonic())]
-
-    async def _show_metrics(self, _: Request) -> Response:
-        return Pieces(await self._metrics.get(), CONTENT_TYPE)
 
     def _status(self) -> tuple[bool, dict[str, Any]]:
         is_connected = self._collector.connected

@@ -26,7 +26,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError, shown, some
 if TYPE_CHECKING:
     from otolith.machine import LoadedMachine
     from otolith.machine_file import ZenohTable
-    from otolith.outlet_tables import MachineOutletsTable
+    from otolith.outlet_tables import OutletsTable
 
 UNIT, HALL_UNIT, SYSUSERS = "otolith@.service", "otolith.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
@@ -240,7 +240,7 @@ def drop_in(
     *,
     command: bool = False,
     networks: Sequence[str] | None = None,
-    outlets: "Sequence[MachineOutletsTable]" = (),
+    outlets: "Sequence[OutletsTable]" = (),
 ) -> str:
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 

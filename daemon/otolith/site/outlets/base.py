@@ -134,6 +134,10 @@ class Known(Protocol):
         """The machines."""
 
     @property
+    def connected(self) -> bool:
+        """Whether reports can come."""
+
+    @property
     def dropped(self) -> Mapping[str, int]:
         """Documents that came faster than they could be read, by where."""
 

@@ -53,6 +53,7 @@ class _KnownPart:
     lock: threading.Lock
     knowledge: _Part
     dropped: Mapping[str, int]
+    connected: bool = True  # To the daemon, with which it ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,7 @@ class DaemonOutlets:
     lock: threading.Lock = field(default_factory=threading.Lock)
     knowledge: Knowledge = field(default_factory=Knowledge)
     dropped: Counter[str] = field(default_factory=Counter)
+    connected: bool = True  # To the daemon, with which it ends
     statuses: list[OutletStatus] = field(default_factory=list)
     _groups: dict[Key, _Group] = field(default_factory=dict)
     _faults: dict[str, list[str]] = field(default_factory=dict)  # Why outlets of a machine cannot be built

@@ -1,13 +1,12 @@
-"""Metrics and health of a daemon for Prometheus, over HTTP, with the bounds of a site on those who ask.
+"""Metrics and health at an address of their own, over HTTP, with the bounds of a site on those who ask.
 
-A site answers ``/metrics`` and ``/healthz`` itself; this outlet is for a daemon without one.
+It is for a daemon without a site, and for a site whose scrapes are to wait for no reader of its pages.
 """
 
 import asyncio
 import contextlib
 import socket
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,12 +19,11 @@ from starlette.routing import Route
 from otolith.outlet_tables import PrometheusOutlet
 from otolith.publishing.zenoh_config import raise_descriptor_limit
 from otolith.site.app import MAX_AGE, Guard
-from otolith.site.metrics import CONTENT_TYPE, Metrics
 from otolith.site.outlets.base import Known, MachineView, Notice, OutletError, OutletSetup, OutletStatus
 from otolith.site.outlets.connections import failure
 from otolith.site.server import Server, listening_on, server_of
 from otolith.site.serving.pace import Fresh
-from otolith.site.serving.pieces import Pieces
+from otolith.site.serving.scrapes import Scrapes
 
 # Threshold: docs/reference/thresholds-site.md has its origin.
 ENDING = 4.0  # s for answers that have begun when it ends
@@ -36,7 +34,6 @@ class MetricsServer:
 
     def __init__(self, options: PrometheusOutlet, known: Known, statuses: Sequence[OutletStatus]) -> None:
         self._options, self._known, self._statuses = options, known, statuses
-        self._scrape = Metrics(known.knowledge)
         self._thread: threading.Thread | None = None
         self._server: Server | None = None
 
@@ -64,26 +61,21 @@ class MetricsServer:
 
     def _app(self) -> Guard:
         pool = ThreadPoolExecutor(1, "make-metrics")
-        metrics, health = Fresh(self._exposition, MAX_AGE, pool), Fresh(self._health, MAX_AGE, pool)
-
-        async def show_metrics(_: Request) -> Response:
-            return Pieces(await metrics.get(), CONTENT_TYPE)
+        scrapes, health = Scrapes(self._known, self._statuses, pool), Fresh(self._health, MAX_AGE, pool)
 
         async def show_health(_: Request) -> Response:
-            return JSONResponse(await health.get())
+            is_connected, status = await health.get()
+            return JSONResponse(status, 200 if is_connected else 503)
 
-        routes = [Route("/metrics", show_metrics), Route("/healthz", show_health)]
+        routes = [Route("/metrics", scrapes.answer), Route("/healthz", show_health)]
         return Guard(Starlette(routes=routes), self._options.hosts)
 
-    def _exposition(self) -> list[bytes]:
+    def _health(self) -> tuple[bool, dict[str, object]]:
         with self._known.lock:
-            return [self._scrape.exposition(self._known.dropped, tuple(self._statuses), time.monotonic())]
-
-    def _health(self) -> dict[str, object]:
-        with self._known.lock:
-            count = len(list(self._known.knowledge))
+            count, is_connected = len(list(self._known.knowledge)), self._known.connected
         outlets = {each.name: each.reason or "ok" for each in self._statuses}
-        return {"status": "ok", "machines": count, "outlets": outlets}
+        text = "ok" if is_connected else "no daemon and no router is connected"
+        return is_connected, {"status": text, "machines": count, "outlets": outlets}
 
 
 def _serve(server: Server, listening: socket.socket) -> None:

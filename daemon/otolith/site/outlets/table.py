@@ -36,13 +36,13 @@ OUTLETS = {
     "webhook": OutletKind("otolith.site.outlets.webhook"),
     "mail": OutletKind("otolith.site.outlets.mail"),
     "opcua": OutletKind("otolith.site.outlets.opcua", "asyncua", "opcua"),
-    "prometheus": OutletKind("otolith.site.outlets.prometheus", "uvicorn", "site"),  # Of a daemon: a site has it
+    "prometheus": OutletKind("otolith.site.outlets.prometheus", "uvicorn", "site"),
 }
 
 
 def configured(table: OutletsTable) -> dict[str, Any]:
     """Return the options of the outlets that a file has, by their names."""
-    return {name: options for name in OUTLETS if (options := getattr(table, name, None)) is not None}
+    return {name: options for name in OUTLETS if (options := getattr(table, name)) is not None}
 
 
 def built(name: str, options: Any, setup: OutletSetup, file: SourceFile | None) -> Outlet:
