@@ -169,9 +169,9 @@ def measure(port: int, process: psutil.Process, plant: Connection, seconds: floa
     plant.send("figures")
     late = 1e3 * np.array(plant.recv())
     return {"scrape_median_ms": float(np.median(scrapes)), "scrape_max_ms": max(scrapes),
-            "beside_pages_median_ms": float(np.median(beside)), "beside_pages_max_ms": max(beside), "site_mb": pss(process),
-            "site_cores": cores, "late_median_ms": float(np.median(late)), "late_99_ms": float(np.quantile(late, 0.99)),
-            "late_max_ms": float(late.max())}  # fmt: skip
+            "beside_pages_median_ms": float(np.median(beside)), "beside_pages_max_ms": max(beside),
+            "site_mb": pss(process), "site_cores": cores, "late_median_ms": float(np.median(late)),
+            "late_99_ms": float(np.quantile(late, 0.99)), "late_max_ms": float(late.max())}  # fmt: skip
 
 
 def shown(tab: Browser, plant: Connection) -> list[float]:

@@ -1,5 +1,6 @@
 """Metrics, and the files for Prometheus, Alertmanager and Grafana: each metric that one names is there."""
 
+import gzip
 import http.client
 import json
 import re
@@ -10,7 +11,7 @@ import time
 import tomllib
 import urllib.parse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,38 @@ def test_promtool_takes_metrics_rules_and_configuration() -> None:
 def test_amtool_takes_the_configuration_of_alertmanager() -> None:
     assert AMTOOL is not None
     assert subprocess.run([AMTOOL, "check-config", str(FILES / "alertmanager.yml")], check=False).returncode == 0
+
+
+def answered(port: int, **headers: str) -> tuple[dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+    try:
+        connection.request("GET", "/metrics", headers={name.replace("_", "-"): text for name, text in headers.items()})
+        answer = connection.getresponse()
+        return {name.lower(): text for name, text in answer.getheaders()}, answer.read()
+    finally:
+        connection.close()
+
+
+def test_who_takes_compressed_metrics_gets_them_also_at_an_address_of_their_own(tmp_path: Path) -> None:
+    own = free_port(socket.SOCK_STREAM)
+    table = f'[outlets.prometheus]\nlisten = "127.0.0.1:{own}"\n'
+    stranger = Stranger("press-9")
+    with closing(stranger), serving(tmp_path, stranger.endpoint, tables=table) as site:
+
+        def is_known() -> bool:
+            stranger.publish(report_of("press-9", None, time.time()))
+            with suppress(OSError):  # it may not listen yet
+                return b'machine="press-9"' in answered(own)[1]
+            return False
+
+        wait_for(is_known)
+        for port in (site.port, own):
+            plain, packed = answered(port), answered(port, accept_encoding="gzip")
+            assert "content-encoding" not in plain[0]
+            assert packed[0]["content-encoding"] == "gzip"
+            assert packed[0]["content-type"] == plain[0]["content-type"]
+            assert len(packed[1]) < len(plain[1]) / 2
+            assert b'machine="press-9"' in gzip.decompress(packed[1])
 
 
 @contextmanager
