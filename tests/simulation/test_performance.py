@@ -15,7 +15,7 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.console import Terminal
 from otolith.cli.main import cli
 from otolith.cli.operation.live_table import LiveTable
-from otolith.health.schema import LANGUAGES, Language, ReportDocument, Status
+from otolith.health.schema import LANGUAGES, LackDocument, Language, ReportDocument, RequirementDocument, Status
 from otolith.health.text import performance_texts, texts_in
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
 from otolith.publishing.html_report import html_report
@@ -197,6 +197,9 @@ def test_history_page_and_live_table_have_them(
     assert figures is not None
     assert last.health is not None
     last = last.model_copy(update={"health": last.health.model_copy(update={"language": language})})
+    lacks = LackDocument(parameter="D", unit="N*m*s/rad", limit=0.002, at=9e5, low=8e5, high=1e6)
+    required = RequirementDocument(value=80.0, met=True, lacks=lacks)
+    figures["omega_max"] = figures["omega_max"].model_copy(update={"requirement": required})
     writer = HistoryWriter(history_path("here", "motor"), Bounds(20_000_000, 3650, 24))
     numbers, _ = writer.open(last.window.start)
     writer.description = describe_machine(machine.twin, machine.plan)
@@ -216,7 +219,8 @@ def test_history_page_and_live_table_have_them(
     for figure in figures.values():
         assert texts.translated(figure.meaning) in page
         assert texts.translated(figure.meaning) in shown
-        assert len(performance_texts(figure, texts)) == 3
+        assert len(performance_texts(figure, texts)) == 3 + (figure.requirement is not None)
+    assert all(texts("met", required="@").partition("@")[0] in text for text in (page, shown))
     assert name not in page
     assert "V_a = 24 V" in page  # the operating point has units
     asked = ["history", "motor", "--since", "1970-01-01", "--every", "window"]

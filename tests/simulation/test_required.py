@@ -47,6 +47,15 @@ def test_the_values_between_which_it_is_kept_are_those_of_the_equation() -> None
     assert high == pytest.approx((0.038 * 24.0 / 80.0 - 0.038 * 0.038) / 6.5, rel=1e-4)
 
 
+def test_on_the_way_to_a_bound_that_is_infinite_no_value_is_looked_for() -> None:
+    free = tuple(replace(row, low=-np.inf, high=np.inf) for row in MOTOR.parameters)
+    figures = tuple(replace(row, required=80.0) for row in MOTOR.performance[1:])
+    twin = replace(MOTOR, name="unbounded", parameters=free, performance=figures)
+    (figure,) = figures_of(twin, estimates_of(twin, {"R_a": 0.1}), window_of(twin, STILL), None)
+    assert figure.value is not None
+    assert not figure.kept
+
+
 def test_what_is_not_kept_now_has_no_such_values() -> None:
     twin = replace(MOTOR, performance=tuple(replace(row, required=90.0) for row in MOTOR.performance[1:]))
     (figure,) = figures_of(twin, estimates_of(twin, {"R_a": 0.1}), window_of(twin, STILL), None)

@@ -140,6 +140,8 @@ def _end(
 ) -> float | None:
     """Return the first value of a parameter on the way between two at which a figure lacks its required value."""
     begin, end = ends
+    if not np.isfinite(end):
+        return None
     for _ in range(REFINEMENTS):
         values = np.linspace(begin, end, SEARCHED)
         means = _evaluated(twin, figure, {**present, name: values[:, None]}, SEARCHED)
