@@ -67,15 +67,25 @@ class ClusterFigures:
 
 
 @contextlib.contextmanager
-def local_cluster(folder: Path, workers: int) -> Iterator[LocalCluster]:
-    """Yield a cluster whose workers are ready; each process is in a group of its own."""
-    from distributed import Client  # noqa: PLC0415 - of the extra
+def local_cluster(folder: Path, workers: int, tls: tuple[Path, Path, Path] | None = None) -> Iterator[LocalCluster]:
+    """Yield a cluster whose workers are ready; each process is in a group of its own.
+
+    ``tls`` are the certificate of the authority, and the certificate and key of all processes.
+    """
+    from distributed import Client, Security  # noqa: PLC0415 - of the extra
 
     file, started = folder / "scheduler.json", list[subprocess.Popen[bytes]]()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    security, options = None, list[str]()
+    if tls is not None:
+        ca, certificate, key = map(str, tls)
+        security = Security(  # type: ignore[no-untyped-call]
+            tls_ca_file=ca, tls_client_cert=certificate, tls_client_key=key, require_encryption=True
+        )
+        options = ["--protocol", "tls", "--tls-ca-file", ca, "--tls-cert", certificate, "--tls-key", key]
 
     def start(*arguments: str) -> None:
-        command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", str(file), "--no-dashboard"]
+        command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", str(file), "--no-dashboard", *options]
         with (folder / "dask.log").open("ab") as log:
             started.append(
                 subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)  # noqa: S603 - our own command
@@ -89,7 +99,7 @@ def local_cluster(folder: Path, workers: int) -> Iterator[LocalCluster]:
         for _ in range(workers):
             start("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(folder))
         address = json.loads(file.read_text(encoding="utf-8"))["address"]
-        with Client(address, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # dask leaves it untyped
+        with Client(address, security=security, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # dask leaves it untyped
             client.wait_for_workers(workers, timeout=PATIENCE)
         yield LocalCluster(address, tuple(started[1:]))
     finally:

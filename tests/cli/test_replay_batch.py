@@ -26,6 +26,7 @@ from tests.cli.replays import MACHINE, recorded
 from tests.cli.test_replay_files import file_of
 from tests.conftest import EXAMPLES
 from tests.messages import assert_says, raises_saying
+from tests.waiting import PATIENCE
 
 BEGIN = 1_790_000_000.0  # Unix s
 
@@ -174,6 +175,27 @@ def test_a_task_that_kills_its_workers_ends_its_machine_only(
     run_batch(items, Deadly(), lambda: False, lambda _: None)
     assert_says(items[0].failure, "gone", "3")
     assert written(tmp_path, "well") == serial["well"]
+
+
+@pytest.mark.parametrize(
+    ("work", "ended_by"),
+    [
+        ("while True: pass", signal.SIGPROF),
+        ("import re; re.match('(a*)*b', 40 * 'a')", signal.SIGPROF),  # no other thread of Python runs meanwhile
+        ("import time; time.sleep(60.0)", signal.SIGALRM),
+    ],
+)
+def test_a_task_that_has_no_end_ends_its_worker(work: str, ended_by: signal.Signals) -> None:
+    code = f"from otolith.runtime.batch.task import limited\nwith limited(0.2, 2.0):\n    {work}"
+    limit = 2.0 if ended_by is signal.SIGALRM else PATIENCE
+    code = code.replace("2.0)", f"{limit})", 1)
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE).returncode == -ended_by
+
+
+def test_a_task_that_ends_leaves_its_worker_alone() -> None:
+    code = "import time\nfrom otolith.runtime.batch.task import limited\nwith limited(0.2, 0.2): pass\n"
+    code += "end = time.process_time() + 0.5\nwhile time.process_time() < end: pass"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE).returncode == 0
 
 
 def test_a_batch_whose_process_is_killed_is_continued(plant: Path, serial: dict[str, str], tmp_path: Path) -> None:

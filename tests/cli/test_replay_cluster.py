@@ -2,6 +2,7 @@
 
 import os
 import signal
+import ssl
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from benchmarks.cluster import local_cluster
 from otolith_drivers.errors import ServiceError
 from tests.cli.commands import otolith
 from tests.cli.test_replay_batch import plant, serial, written
+from tests.drivers.certificates import certificate
 from tests.messages import raises_saying
 
 __all__ = ["plant", "serial"]
@@ -43,6 +45,29 @@ def test_a_cluster_that_loses_a_worker_and_the_client_has_the_reports_of_a_seria
         os.killpg(cluster.workers[0].pid, signal.SIGKILL)
         _, told = again.communicate(timeout=PATIENCE)
     assert again.returncode == 0, told
+    assert {name: written(tmp_path / "out", name) for name in serial} == serial
+
+
+def identity(folder: Path, name: str) -> tuple[Path, Path]:
+    """Certificate and key in PEM form, of which the certificate is its own authority."""
+    made, key = certificate(folder, name)
+    path = folder / f"{name}.crt"
+    path.write_text(ssl.DER_cert_to_PEM_cert(made.read_bytes()), encoding="ascii")
+    return path, key
+
+
+@pytest.mark.full
+def test_a_cluster_with_tls_computes_for_those_who_have_its_certificates(
+    plant: Path, serial: dict[str, str], tmp_path: Path
+) -> None:
+    own, key = identity(tmp_path, "node")
+    foreign, foreign_key = identity(tmp_path, "stranger")
+    command = ["replay", plant / "hall", plant / "data", "--output", tmp_path / "out", "--scheduler"]
+    with local_cluster(tmp_path, 1, (own, own, key)) as cluster:
+        assert cluster.address.startswith("tls://")
+        with raises_saying(ServiceError, cluster.address):
+            otolith(*command, cluster.address, "--ca", own, "--certificate", foreign, "--key", foreign_key)
+        otolith(*command, cluster.address, "--ca", own, "--certificate", own, "--key", key)
     assert {name: written(tmp_path / "out", name) for name in serial} == serial
 
 

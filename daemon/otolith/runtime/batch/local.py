@@ -5,12 +5,12 @@ import time
 from typing import Any
 
 from otolith import kernel_cache
-from otolith.runtime.batch.task import ReplayOutcome, ReplayTask, perform_task
+from otolith.runtime.batch.task import TASK_TIMEOUT, ReplayOutcome, ReplayTask, perform_task
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import OtolithError
 
 POLL = 0.2  # s between two looks at the workers, if none of them answers; the reaction time to a signal
-GONE = "its worker has ended"
+GONE = f"its worker has ended: it died, or computed a part for {TASK_TIMEOUT:g} s"
 
 
 def main(connection: Any) -> None:

@@ -4,12 +4,14 @@ A worker opens files and writes none. Whoever keeps the outcome, with the checkp
 other worker, or repeated: the reports are the same.
 """
 
+import contextlib
 import json
 import os
+import signal
 import threading
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,6 +35,8 @@ MAX_REASON = 300  # characters of the error of a library
 MAX_CHECKPOINT_BYTES = 1 << 30  # unpacked
 MAX_REPORT_BYTES = 16 << 20  # of reports in one outcome, after which the rest is another task
 MAX_TASK_FILES = 500
+TASK_TIMEOUT = 1800.0  # s of processor time of a task, with kernels to compile; then its worker ends
+TASK_WAIT = 6 * TASK_TIMEOUT  # s; the same if it waits, also for a processor
 
 _alone = threading.Lock()  # a worker of a cluster may have several threads
 
@@ -99,9 +103,25 @@ def perform_task(task: ReplayTask) -> ReplayOutcome:
     Raises:
         ConfigurationError: the machine file or the checkpoint cannot be used here.
     """
-    with _alone:
+    with _alone, limited(TASK_TIMEOUT, TASK_WAIT):
         machine = _loaded(task.machine, task.machine.stat().st_mtime_ns)
         return _perform(machine, task, unpacked(machine, task.checkpoint))
+
+
+@contextlib.contextmanager
+def limited(computing: float, waiting: float) -> Iterator[None]:
+    """End this process if the block takes more seconds of processor time, or in all.
+
+    The kernel does it by signals, as no thread of Python runs while a library computes and does not let it.
+    """
+    timers = {signal.ITIMER_PROF: computing, signal.ITIMER_REAL: waiting}
+    try:
+        for timer, seconds in timers.items():
+            signal.setitimer(timer, seconds)
+        yield
+    finally:
+        for timer in timers:
+            signal.setitimer(timer, 0.0)
 
 
 def first_checkpoint(machine: LoadedMachine, state: AdaptationState, files: Sequence[Path]) -> Checkpoint:
