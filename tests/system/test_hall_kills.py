@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -77,9 +77,9 @@ def follow(reports: list[ReportDocument]) -> bool:
 
 def fill(disk: Path) -> Path:
     """Fill a disk, and return the file that does it."""
-    with (disk / "ballast").open("wb") as ballast:
-        free = os.statvfs(disk)
-        ballast.write(bytes(free.f_bavail * free.f_frsize))
+    with suppress(OSError), (disk / "ballast").open("wb", buffering=0) as ballast:  # ENOSPC
+        while True:
+            ballast.write(bytes(1 << 16))
     return disk / "ballast"
 
 
