@@ -10,6 +10,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from otolith.site import server as server_module
 from otolith.site.server import MAX_UNREAD, Server, listening_on, server_of
+from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.serving.live import Places
 from otolith.site.serving.pieces import PIECE, Pieces
 from tests.conftest import free_port
@@ -30,17 +31,18 @@ def serving(content: list[bytes]) -> ASGIApp:
     return page
 
 
-def with_server(content: list[bytes], test: Test) -> None:
+def with_server(content: list[bytes], test: Test, counts: Counts | None = None) -> None:
     """Run a test beside a server; it opens connections, which send something, and are closed at its end."""
 
     async def run() -> None:
-        server, port = server_of(serving(content)), free_port(socket.SOCK_STREAM)
+        server, port = server_of(serving(content), hindered=counts), free_port(socket.SOCK_STREAM)
         with listening_on(("127.0.0.1", port)) as listening, ExitStack() as clients:
             loop = asyncio.get_running_loop()
 
-            async def opened(sent: bytes = b"") -> socket.socket:
+            async def opened(sent: bytes = b"", source: str = "127.0.0.1") -> socket.socket:
                 client = clients.enter_context(socket.socket())
                 client.setblocking(False)
+                client.bind((source, 0))
                 await loop.sock_connect(client, ("127.0.0.1", port))
                 await loop.sock_sendall(client, sent)
                 return client
@@ -150,3 +152,36 @@ def test_one_address_leaves_places_for_live_events_to_others() -> None:
         assert each is not None
         places.leave("a", each)
     assert [places.take("d") is not None for _ in range(5)] == [True, True, True, True, False]
+
+
+def test_of_many_connections_those_of_the_address_with_the_most_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "PATIENCE", 3600.0)
+    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 20)
+    counts = Counts()
+
+    async def test(server: Server, opened: Open) -> None:
+        first = await opened()  # which has waited for longest
+        for _index in range(60):
+            await opened(source="127.0.0.2")
+        while counts[Hindered.ROOM] < 41:
+            await asyncio.sleep(0.01)
+        loop = asyncio.get_running_loop()
+        await loop.sock_sendall(first, REQUEST)
+        assert (await loop.sock_recv(first, 100)).split()[1] == b"200"
+        assert len(server.server_state.connections) <= 20
+
+    with_server(SMALL, test, counts)
+    assert set(counts) == {Hindered.ROOM}
+
+
+def test_who_is_cut_is_counted_by_why() -> None:
+    counts = Counts()
+
+    async def test(_: Server, opened: Open) -> None:
+        await opened()
+        await opened(REQUEST)
+        while not (counts[Hindered.IDLE] and counts[Hindered.SLOW]):
+            await asyncio.sleep(0.05)
+
+    with_server(LARGE, test, counts)
+    assert set(counts) == {Hindered.IDLE, Hindered.SLOW}

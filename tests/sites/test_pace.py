@@ -11,8 +11,9 @@ from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.past import PastQuery, past_of
 from otolith.site.serving import past_pages
+from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.serving.pace import PAGE_PAUSE, Fresh, Turns
-from otolith.site.serving.past_pages import MAX_LOOKING, MAX_WAITING, PastPages
+from otolith.site.serving.past_pages import MAX_LOOKING, MAX_OF_ADDRESS, MAX_WAITING, Key, PastPages
 from otolith.site.serving.pieces import PIECE, grouped
 from tests.storage.histories import MACHINE, SITE
 
@@ -101,6 +102,9 @@ class Works:
 
     knowledge, lock = Knowledge(), threading.Lock()
 
+    def __init__(self) -> None:
+        self.hindered = Counts()
+
     def where(self, site: str, machine: str) -> str:
         """Return the endpoint of a machine."""
         return f"{site}/{machine}"
@@ -143,12 +147,33 @@ def test_more_pages_of_the_past_than_are_made_are_refused(monkeypatch: pytest.Mo
     pages, queries = asked(monkeypatch, free)
 
     async def run() -> None:
-        waiting = [asyncio.create_task(pages.get((SITE, f"m-{index}", "1h", "en"), None)) for index in range(100)]
+        keys: list[tuple[Key, str]] = [((SITE, f"m-{index}", "1h", "en"), f"{index % 50}") for index in range(100)]
+        waiting = [asyncio.create_task(pages.get(key, None, address)) for key, address in keys]
         await asyncio.sleep(0.2)
         assert len(queries) == MAX_LOOKING
         free.set()
         found = await asyncio.gather(*waiting)
         assert sum(page is not None for page in found) == MAX_LOOKING + MAX_WAITING
+        assert +pages._collector.hindered == {Hindered.HISTORY_BUSY: 100 - MAX_LOOKING - MAX_WAITING}
+
+    asyncio.run(run())
+
+
+def test_one_address_leaves_places_of_the_past_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = threading.Event()
+    pages, _ = asked(monkeypatch, free)
+
+    async def run() -> None:
+        waiting = [asyncio.create_task(pages.get((SITE, f"m-{index}", "1h", "en"), None, "a")) for index in range(100)]
+        await asyncio.sleep(0.1)
+        other = asyncio.create_task(pages.get((SITE, "other", "1h", "en"), None, "b"))
+        await asyncio.sleep(0.1)
+        free.set()
+        assert sum(page is not None for page in await asyncio.gather(*waiting)) == MAX_OF_ADDRESS
+        assert await other is not None
+        assert +pages._collector.hindered == {Hindered.HISTORY_ADDRESS: 100 - MAX_OF_ADDRESS}
+        assert await pages.get((SITE, "later", "1h", "en"), None, "a") is not None
+        assert not pages._open
 
     asyncio.run(run())
 

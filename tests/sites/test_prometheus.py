@@ -25,6 +25,7 @@ from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
 from otolith.site.metrics import Metrics
 from otolith.site.outlets.base import OutletStatus
 from otolith.site.outlets.table import OUTLETS
+from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.settings import SiteFile
 from tests.conftest import free_port
 from tests.hostile import HOSTILE
@@ -70,6 +71,14 @@ def test_names_keep_the_conventions_of_prometheus() -> None:
         assert re.fullmatch(r"[a-z_]+", family.name)
         assert family.documentation.endswith(".")
         assert all(sample.name.endswith("_total") for sample in family.samples) == (family.type == "counter")
+
+
+def test_who_was_refused_or_cut_is_counted_from_zero() -> None:
+    counts = Counts({Hindered.HISTORY_BUSY: 3, Hindered.SLOW: 2})
+    text = Metrics(known()).exposition({}, (), START, counts).decode()
+    assert 'otolith_site_requests_refused_total{reason="history_busy"} 3.0' in text
+    assert 'otolith_site_connections_cut_total{reason="slow"} 2.0' in text
+    assert all(f'reason="{each.value}"}} ' in text for each in Hindered)
 
 
 def test_a_silent_machine_has_a_state_and_no_values() -> None:

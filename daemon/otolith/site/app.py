@@ -236,7 +236,7 @@ class SitePages:
             return await self._show_nothing(request, Exception())
         span = asked if asked in SPANS else FIRST_SPAN
         try:
-            page = await self._past.get((site, name, span, language), known.report)
+            page = await self._past.get((site, name, span, language), known.report, _address(request))
         except (ValueError, LookupError, ArithmeticError, OSError):  # anybody may have published it
             return await self._message(language, "unreadable", 502)
         if page is None:
@@ -301,7 +301,12 @@ class SitePages:
         return JSONResponse(status, 200 if is_connected else 503)
 
     async def _show_live(self, request: Request) -> Response:
-        return Live(self._halls[self._language(request)].get, _filter(request), self._live)
+        return Live(self._halls[self._language(request)].get, _filter(request), self._live, self._collector.hindered)
+
+
+def _address(request: Request) -> str:
+    """Return who asks."""
+    return request.client.host if request.client else ""
 
 
 def _user(request: Request) -> User | None:

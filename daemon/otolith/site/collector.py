@@ -18,6 +18,7 @@ from otolith.publishing.reader_sessions import QUERY_TIMEOUT, Arrival, ReaderSes
 from otolith.publishing.zenoh_config import MAX_MESSAGE_BYTES, Connection
 from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, prefix
 from otolith.site.known import MAX_MACHINES, Knowledge
+from otolith.site.serving.counts import Counts
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ class Collector:
         self.certificate = connection.credentials.certificate  # Of the site
         self.knowledge, self.lock = Knowledge(expected), threading.Lock()
         self.dropped: Counter[str] = Counter()
+        self.hindered: Counts = Counter()  # Of those who read the site
         limits = {"transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
         self._sessions = ReaderSessions(connection, (REPORT,), self._put, limits=limits)
         self._waiting: queue.Queue[tuple[Arrival, bool]] = queue.Queue(MAX_WAITING)  # And whether it is of the past

@@ -11,6 +11,7 @@ from otolith.health.limits import LEVELS, Level
 from otolith.health.schema import CountersDocument
 from otolith.site.known import MAX_MACHINES, MAX_PARAMETERS, KnownMachine, RefusedFor
 from otolith.site.outlets.base import Machines, OutletStatus
+from otolith.site.serving.counts import REASONS, Counts
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 GAUGES = {
@@ -46,7 +47,9 @@ class Metrics:
         self._knowledge = knowledge
         self._written: dict[tuple[str, str], tuple[object, Lines]] = {}  # With what they depend on
 
-    def exposition(self, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float) -> bytes:
+    def exposition(
+        self, dropped: Mapping[str, int], outlets: Iterable[OutletStatus], now: float, hindered: Counts | None = None
+    ) -> bytes:
         """Return the metrics as text; a machine of which nothing is known has a state, and no values."""
         machines, parts = [self._lines(machine, now) for machine in self._knowledge], list[str]()
         for name, text in GAUGES.items():
@@ -58,6 +61,9 @@ class Metrics:
         parts += _counts("otolith_site_documents_refused_total", "Documents that were refused.", "reason", refused)
         text = "Documents that came faster than they could be read."
         parts += _counts("otolith_site_documents_dropped_total", text, "reason", {"queue": 0} | dict(dropped))
+        for name, (text, reasons) in REASONS.items():
+            counted = {each.value: 0 if hindered is None else hindered[each] for each in reasons}
+            parts += _counts(name, text, "reason", counted)
         parts += _outlets(tuple(outlets))
         return "".join(parts).encode(errors="replace")
 

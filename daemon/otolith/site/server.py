@@ -6,8 +6,11 @@ import socket
 import ssl
 import sys
 from asyncio import sslproto
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -20,6 +23,7 @@ from otolith.site.app import SitePages
 from otolith.site.collector import Collector
 from otolith.site.outlets.runner import OutletRunner
 from otolith.site.outlets.table import running
+from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.settings import SiteFile
 from otolith_drivers.errors import ServiceError
 
@@ -40,6 +44,10 @@ SWITCH = 0.001  # s that a thread may keep the others waiting
 
 class _Patient(H11Protocol):
     """A connection that is cut once it waits for a request, or for its reader, for too long."""
+
+    def __init__(self, *given: Any, hindered: Counts, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._hindered = hindered
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         super().connection_made(transport)
@@ -74,15 +82,24 @@ class _Patient(H11Protocol):
             self._phase, self._since = phase, now
         return now - self._since
 
-    def cut(self) -> None:
+    @property
+    def address(self) -> str:
+        """Of the other side."""
+        return self.client[0] if self.client else ""
+
+    def cut(self, reason: Hindered) -> None:
         """End it, with all that waits; a connection that is only closed waits for its reader."""
+        if not self.transport.is_closing():
+            self._hindered[reason] += 1
         self.transport.abort()
 
     def _make_room(self) -> None:
-        """Cut who has been waiting for a request for the longest time."""
-        others = [each for each in self.connections if isinstance(each, _Patient) and each.waits and each is not self]
+        """Of the address with the most connections, cut who has been waiting for a request for the longest time."""
+        known = [each for each in self.connections if isinstance(each, _Patient)]
+        held = Counter(each.address for each in known)
+        others = [each for each in known if each.waits and each is not self]
         if others:
-            min(others, key=lambda each: each._since).cut()
+            min(others, key=lambda each: (-held[each.address], each._since)).cut(Hindered.ROOM)
 
 
 class Server(uvicorn.Server):
@@ -123,16 +140,17 @@ class Server(uvicorn.Server):
         for each in slow:
             if excess > 0:
                 excess -= each.unread
-                each.cut()
+                each.cut(Hindered.MEMORY)
         for each in known:
             if ages[each] > PATIENCE:
-                each.cut()
+                each.cut(Hindered.SLOW if each.unread else Hindered.IDLE)
 
 
-def server_of(app: ASGIApp, tls: ssl.SSLContext | None = None) -> Server:
-    """Return what serves an application, encrypted if ``tls`` is given."""
+def server_of(app: ASGIApp, tls: ssl.SSLContext | None = None, hindered: Counts | None = None) -> Server:
+    """Return what serves an application, encrypted if ``tls`` is given; ``hindered`` counts who is cut."""
+    protocol: Any = partial(_Patient, hindered=Counter() if hindered is None else hindered)
     return Server(uvicorn.Config(
-        app, http=_Patient, ws="none", lifespan="off", log_config=None, log_level=LOGGED, access_log=False,
+        app, http=protocol, ws="none", lifespan="off", log_config=None, log_level=LOGGED, access_log=False,
         server_header=False, date_header=True, limit_concurrency=MAX_CONNECTIONS + ACCEPTED, backlog=ACCEPTED,
         timeout_keep_alive=round(PATIENCE), timeout_graceful_shutdown=CLOSING, loop="asyncio", proxy_headers=False,
         ssl_context_factory=None if tls is None else lambda *_: tls,
@@ -172,7 +190,7 @@ def run_site(
     sslproto.SSLProtocol.max_size = TLS_BUFFER
     orders = None if access is None else Orders(access.users, access.signer, collector.command)
     pages = SitePages(collector, settings, [outlet.status for outlet in outlets], orders)
-    server = server_of(pages.app(), None if access is None else access.tls)
+    server = server_of(pages.app(), None if access is None else access.tls, collector.hindered)
     try:
         listening = listening_on(settings.http.address)
     except OSError as error:

@@ -19,6 +19,7 @@ from otolith.site.outlets.base import OutletSetup
 from otolith.site.outlets.process import DaemonOutlets, places
 from otolith.site.outlets.runner import OutletRunner
 from otolith.site.outlets.table import OUTLETS, runners_of, running
+from otolith.site.serving.counts import Counts
 from otolith.site.settings import load_site
 from otolith_drivers.config_files import parse, read, validate
 from otolith_drivers.errors import ConfigurationError
@@ -46,6 +47,7 @@ class Works:
     def __init__(self, rig: Rig) -> None:
         self.rig, self.lock, self._number = rig, threading.Lock(), 0
         self.knowledge, self.dropped, self.connected = Knowledge(), dict[str, int](), True
+        self.hindered = Counts()
 
     def report(
         self, machine: str, state: Level = Level.OK, events: tuple[EventDocument, ...] = (), **more: Any

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from otolith.health.limits import Level
 from otolith.health.schema import EventDocument, Language, NoticeDocument, ReportDocument
 from otolith.site.known import KnownMachine, RefusedFor
+from otolith.site.serving.counts import Counts
 
 
 class OutletError(Exception):
@@ -136,6 +137,10 @@ class Known(Protocol):
     @property
     def connected(self) -> bool:
         """Whether reports can come."""
+
+    @property
+    def hindered(self) -> Counts:
+        """Who was refused or cut, by why."""
 
     @property
     def dropped(self) -> Mapping[str, int]:

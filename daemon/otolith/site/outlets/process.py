@@ -19,6 +19,7 @@ from otolith.site.known import Knowledge, KnownMachine, RefusedFor
 from otolith.site.outlets.base import OutletSetup, OutletStatus
 from otolith.site.outlets.runner import OutletRunner
 from otolith.site.outlets.table import built, configured, stop
+from otolith.site.serving.counts import Counts
 from otolith_drivers.config_files import SourceFile
 from otolith_drivers.errors import OtolithError
 
@@ -54,6 +55,7 @@ class _KnownPart:
     knowledge: _Part
     dropped: Mapping[str, int]
     connected: bool = True  # To the daemon, with which it ends
+    hindered: Counts = field(default_factory=Counter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,7 @@ class DaemonOutlets:
     knowledge: Knowledge = field(default_factory=Knowledge)
     dropped: Counter[str] = field(default_factory=Counter)
     connected: bool = True  # To the daemon, with which it ends
+    hindered: Counts = field(default_factory=Counter)
     statuses: list[OutletStatus] = field(default_factory=list)
     _groups: dict[Key, _Group] = field(default_factory=dict)
     _faults: dict[str, list[str]] = field(default_factory=dict)  # Why outlets of a machine cannot be built
@@ -135,7 +138,7 @@ class DaemonOutlets:
 
     def _join(self, machine: MachineOutlets, key: Key, options: Any) -> None:
         if (group := self._groups.get(key)) is None:
-            known = _KnownPart(self.lock, _Part(self.knowledge, ()), self.dropped)
+            known = _KnownPart(self.lock, _Part(self.knowledge, ()), self.dropped, hindered=self.hindered)
             setup = OutletSetup(machine.file.parent, "Otolith", sender=machine.key, known=known, statuses=self.statuses)
             outlet = built(key[0], options, setup, None)
             runner = OutletRunner(self._new_name(key[0]), outlet, known, setup, options.per_hour)

@@ -48,7 +48,7 @@ class MetricsServer:
             listening = listening_on(self._options.address)
         except OSError as error:
             raise OutletError(failure(error, f"listen = {self._options.listen}")) from error
-        server = self._server = server_of(self._app())
+        server = self._server = server_of(self._app(), hindered=self._known.hindered)
         self._thread = threading.Thread(target=_serve, args=(server, listening), name="metrics", daemon=True)
         self._thread.start()
         return True

@@ -8,6 +8,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from otolith.site.hall import Filter, Rendered, Shown, removal
+from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.serving.pieces import grouped
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
@@ -46,16 +47,17 @@ class Places:
 class Live(Response):
     """A stream of events; who does not take them is cut by the server, as every slow reader."""
 
-    def __init__(self, look: Callable[[], Awaitable[Shown]], chosen: Filter, places: Places) -> None:
+    def __init__(self, look: Callable[[], Awaitable[Shown]], chosen: Filter, places: Places, hindered: Counts) -> None:
         """``look`` returns the hall."""
         super().__init__(media_type="text/event-stream")
-        self._look, self._chosen, self._places = look, chosen, places
+        self._look, self._chosen, self._places, self._hindered = look, chosen, places, hindered
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send events until the browser leaves, or its place is another's."""
         address = (scope.get("client") or ("", 0))[0]
         ended = self._places.take(address)
         if ended is None:
+            self._hindered[Hindered.LIVE] += 1
             text = f"{MAX_LIVE} browsers get live events already\n"
             await PlainTextResponse(text, 503)(scope, receive, send)
             return

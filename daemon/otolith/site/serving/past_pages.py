@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -10,10 +10,12 @@ from otolith.health.schema import Language, ReportDocument
 from otolith.publishing.received_history import received_page
 from otolith.site.collector import Collector
 from otolith.site.past import SPANS, PastAnswers, PastQuery, past_of
+from otolith.site.serving.counts import Hindered
 
 # Thresholds: docs/reference/thresholds-site.md has the origin of each.
 MAX_LOOKING = 4  # pages that are made at a time
 MAX_WAITING = 12  # pages that wait to be made
+MAX_OF_ADDRESS = 8  # pages that are made, or wait, for one address
 PAST_AGE = 10.0  # s for which a page is given to others who ask for it
 MAX_KEPT = 16  # pages that are kept for so long
 
@@ -43,22 +45,24 @@ class PastPages:
         self._looking = asyncio.Semaphore(MAX_LOOKING)
         self._daemons: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)  # By where it is asked
         self._pages: dict[Key, asyncio.Task[PastPage]] = {}
-        self._open = 0  # pages that are being made, or wait for it
+        self._open: Counter[str] = Counter()  # pages that are being made, or wait for it, by who asks
 
-    async def get(self, key: Key, latest: ReportDocument | None) -> PastPage | None:
-        """Return a page; None if too many wait for theirs.
+    async def get(self, key: Key, latest: ReportDocument | None, address: str = "") -> PastPage | None:
+        """Return a page; None if too many wait for theirs, or for one ``address``.
 
         Raises:
             ValueError, LookupError, ArithmeticError, OSError: it cannot be shown; anybody may have published it.
         """
         if key not in self._pages:
-            if self._open >= MAX_LOOKING + MAX_WAITING:
+            is_full = self._open.total() >= MAX_LOOKING + MAX_WAITING
+            if is_full or self._open[address] >= MAX_OF_ADDRESS:
+                self._collector.hindered[Hindered.HISTORY_BUSY if is_full else Hindered.HISTORY_ADDRESS] += 1
                 return None
-            self._open += 1
-            self._pages[key] = asyncio.create_task(self._page(key, latest))
+            self._open[address] += 1
+            self._pages[key] = asyncio.create_task(self._page(key, latest, address))
         return await asyncio.shield(self._pages[key])  # who leaves does not end it for the others
 
-    async def _page(self, key: Key, latest: ReportDocument | None) -> PastPage:
+    async def _page(self, key: Key, latest: ReportDocument | None, address: str) -> PastPage:
         loop, lock = asyncio.get_running_loop(), self._daemons[self._collector.where(*key[:2])]
         try:
             await lock.acquire()
@@ -70,7 +74,8 @@ class PastPages:
             finally:
                 loop.call_later(loop.time() - begun, lock.release)  # half of the time no page asks this daemon
         finally:
-            self._open -= 1
+            self._open[address] -= 1
+            self._open += Counter()  # without those that have none
             loop.call_later(PAST_AGE, self._pages.pop, key, None)
             for old in [key for key, task in self._pages.items() if task.done()][:-MAX_KEPT]:
                 del self._pages[old]
@@ -83,6 +88,7 @@ class PastPages:
         past = await loop.run_in_executor(
             self._asking, past_of, self._collector.ask, query, latest, (key[3], self._zone)
         )
+        self._collector.hindered[Hindered.UNANSWERED] += past.missing
         page = await loop.run_in_executor(self._making, received_page, past.history, query.since, now)
         before, header, after = page.partition("<header>")
         above, heading, below = after.partition("<h2>")  # texts from outside are escaped

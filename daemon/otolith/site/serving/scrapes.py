@@ -36,4 +36,6 @@ class Scrapes:
 
     def _written(self) -> bytes:
         with self._known.lock:
-            return self._metrics.exposition(self._known.dropped, tuple(self._outlets), time.monotonic())
+            return self._metrics.exposition(
+                self._known.dropped, tuple(self._outlets), time.monotonic(), self._known.hindered
+            )
