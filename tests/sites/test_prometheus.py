@@ -19,11 +19,12 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from otolith.health.limits import Level
-from otolith.health.schema import CostDocument, DriverDocument
-from otolith.outlet_tables import OutletsTable
+from otolith.health.schema import CostDocument, DriverDocument, ReportDocument
+from otolith.outlet_tables import MachineOutlets, OutletsTable
 from otolith.site.known import MAX_PARAMETERS, Knowledge, RefusedFor
 from otolith.site.metrics import Metrics
 from otolith.site.outlets.base import OutletStatus
+from otolith.site.outlets.process import DaemonOutlets
 from otolith.site.outlets.table import OUTLETS
 from otolith.site.serving.counts import Counts, Hindered
 from otolith.site.settings import SiteFile
@@ -32,6 +33,7 @@ from tests.hostile import HOSTILE
 from tests.sites.machines import Stranger, raised, report_of, sent
 from tests.sites.serving import serving
 from tests.storage.histories import SITE, START
+from tests.variants import often
 from tests.waiting import wait_for, within
 
 FILES = Path(__file__).parents[2] / "config" / "site"
@@ -228,13 +230,32 @@ def _asked(address: str, path: str, query: dict[str, str]) -> Any:
         connection.close()
 
 
+@contextmanager
+def at_act(place: str, folder: Path) -> Iterator[tuple[int, Callable[[], None]]]:
+    """A site, or the outlet of a daemon: the port at which it is scraped, and what lets a machine report once more."""
+
+    def report() -> ReportDocument:
+        return report_of("press-9", None, time.time(), state=Level.ACT, events=(raised(),))
+
+    if place == "site":
+        with closing(Stranger("press-9")) as stranger, serving(folder, stranger.endpoint) as site:
+            yield site.port, lambda: stranger.publish(report())
+        return
+    port = free_port(socket.SOCK_STREAM)
+    table = OutletsTable.model_validate({"prometheus": {"listen": f"127.0.0.1:{port}"}})
+    own = MachineOutlets(SITE, "press-9", folder / "machine.toml", table)
+    with DaemonOutlets() as outlets:
+        outlets.take(own.key, own)
+        yield port, lambda: outlets.take(own.key, (0, report().to_json().encode()))
+
+
 @pytest.mark.skipif(PROMETHEUS is None, reason="no prometheus: apt install prometheus")
-def test_a_real_prometheus_scrapes_a_site_and_its_alert_fires(tmp_path: Path) -> None:
-    stranger = Stranger("press-9")
-    with serving(tmp_path, stranger.endpoint) as site, prometheus(tmp_path, f"127.0.0.1:{site.port}") as ask:
+@pytest.mark.parametrize("place", often(["site"], ["site", "daemon"]))
+def test_a_real_prometheus_scrapes_it_and_its_alert_fires(place: str, tmp_path: Path) -> None:
+    with at_act(place, tmp_path) as (port, report), prometheus(tmp_path, f"127.0.0.1:{port}") as ask:
 
         def firing() -> set[tuple[str, str]]:
-            stranger.publish(report_of("press-9", None, time.time(), state=Level.ACT, events=(raised(),)))
+            report()
             alerts = ask("alerts")["alerts"]
             return {(row["labels"]["alertname"], row["labels"]["machine"]) for row in alerts
                     if row["state"] == "firing"}  # fmt: skip
@@ -248,4 +269,3 @@ def test_a_real_prometheus_scrapes_a_site_and_its_alert_fires(tmp_path: Path) ->
                 assert "error" not in found, expression
                 is_new = "rate(" in expression or "latency" in expression
                 assert is_new or found["result"] or "refused" in expression, expression
-    stranger.close()
