@@ -3,10 +3,13 @@
     python -m benchmarks.hall --machines 20 --machines 50 --seconds 60
 
 Each machine is a DC motor whose record of 100 Hz is replayed in real time, in windows of 2 s; a share of them has a
-winding that loses turns. The daemon is ``otolith run FOLDER``, as it is installed. Measured are, from the moment at
-which all workers are ready: processor time and memory (PSS, of all its processes), the latency of reports (from the end
-of a window until it is published) and the windows that were missed. Exponents say how the costs grow with the number
-of machines.
+winding that loses turns. The daemon is ``otolith run FOLDER`` in the environment of its unit. Measured are, from the
+moment at which all workers are ready: processor time and memory (PSS, of all its processes), the latency of reports
+(from the end of a window until it is published), the windows that were missed, and by how much the histories grow.
+Exponents say how the costs grow with the number of machines.
+
+A computer that is busy with something else delays reports and lets windows be missed; processor time for each window
+that was due, memory and bytes are the same on it.
 """
 
 import contextlib
@@ -36,9 +39,11 @@ from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith_drivers.plant.scenario import load_scenario, simulate
 
-CONFIG = Path(__file__).parents[1] / "config"
+ROOT = Path(__file__).parents[1]
+CONFIG, UNIT = ROOT / "config", ROOT / "systemd" / "otolith.service"
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 RATE = 100  # records per second
+WINDOW = 2.0  # s
 SETTLING = 10.0  # s from the first report of the last machine until it is measured
 PATIENCE = 300.0  # s until the first report of the last machine
 MACHINE = """[machine]
@@ -81,6 +86,7 @@ class HallFigures:
     seconds: float  # Measured
     cores: float  # Processor time of all processes, per second
     cores_of_each: tuple[float, ...]  # First the process that acquires, as for memory
+    ms_per_window: float  # Processor time of all processes for each window that was due
     pss_mb: float
     pss_of_each_mb: tuple[float, ...]  # First the process that acquires
     threads: int  # Of the process that acquires
@@ -90,6 +96,14 @@ class HallFigures:
     reports: int
     windows_missed: int
     samples_lost: int
+    history_bytes: int  # By which the histories grew
+
+
+def environment_of_unit() -> dict[str, str]:
+    """Return the variables that the unit of a hall sets."""
+    lines = UNIT.read_text(encoding="utf-8").splitlines()
+    settings = [line.removeprefix("Environment=") for line in lines if line.startswith("Environment=")]
+    return dict(pair.split("=", 1) for setting in settings for pair in setting.split())
 
 
 def write_records(folder: Path, seconds: float) -> None:
@@ -128,7 +142,12 @@ def pss(process: psutil.Process) -> float:
 def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, endpoint: str) -> HallFigures:
     """Run a daemon for the machines of ``paths``, and return what it cost."""
     state = folder / f"state-{machines}"
-    environment = {**os.environ, "XDG_STATE_HOME": str(state), "XDG_RUNTIME_DIR": str(folder / "run")}
+    environment = {
+        **os.environ,
+        **environment_of_unit(),
+        "XDG_STATE_HOME": str(state),
+        "XDG_RUNTIME_DIR": str(folder / "run"),
+    }
     (folder / "run").mkdir(mode=0o700, exist_ok=True)
     received: queue.SimpleQueue[str] = queue.SimpleQueue()
     command = [sys.executable, "-m", "otolith", "run", *map(str, paths)]
@@ -138,7 +157,7 @@ def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, 
             with Subscriber(Connection((endpoint,)), received.put):
                 _wait_for_all(received, machines, daemon)
                 time.sleep(SETTLING)
-                return _measured(daemon, received, machines, seconds)
+                return _measured(daemon, received, machines, seconds, state)
         finally:
             daemon.send_signal(signal.SIGTERM)
             daemon.wait(timeout=60)
@@ -155,11 +174,12 @@ def _wait_for_all(received: "queue.SimpleQueue[str]", machines: int, daemon: "su
 
 
 def _measured(
-    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float
+    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float, state: Path
 ) -> HallFigures:
     root = psutil.Process(daemon.pid)
     tree = [root, *root.children(recursive=True)]
     spent, begun, first = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic(), received.qsize()
+    bytes_before = _history_bytes(state)
     time.sleep(seconds)
     elapsed = time.monotonic() - begun
     cores = tuple((sum(each.cpu_times()[:2]) - one) / elapsed for each, one in zip(tree, spent, strict=True))
@@ -179,6 +199,7 @@ def _measured(
         seconds=elapsed,
         cores=sum(cores),
         cores_of_each=cores,
+        ms_per_window=sum(cores) * 1e3 * WINDOW / machines,
         pss_mb=sum(memory),
         pss_of_each_mb=tuple(memory),
         threads=root.num_threads(),
@@ -188,7 +209,13 @@ def _measured(
         reports=len(documents),
         windows_missed=rise(lambda counters: counters.windows_missed),
         samples_lost=rise(lambda counters: counters.lost),
+        history_bytes=_history_bytes(state) - bytes_before,
     )
+
+
+def _history_bytes(state: Path) -> int:
+    """Return the size of all histories, with what is not yet in their tables."""
+    return sum(path.stat().st_size for path in state.rglob("*.sqlite*") if not path.name.endswith("-shm"))
 
 
 def exponents(figures: Sequence[HallFigures]) -> dict[str, float]:
@@ -196,7 +223,7 @@ def exponents(figures: Sequence[HallFigures]) -> dict[str, float]:
     machines = np.log([each.machines for each in figures])
     return {
         name: float(np.polyfit(machines, np.log([getattr(each, name) for each in figures]), 1)[0])
-        for name in ("cores", "pss_mb")
+        for name in ("cores", "pss_mb", "history_bytes")
         if len(figures) > 1
     }
 
@@ -221,17 +248,20 @@ def main(machines: tuple[int, ...], seconds: float, faulty: float, as_json: bool
     if as_json:
         print(json.dumps({"halls": [asdict(each) for each in figures], "exponents": exponents(figures)}, indent=2))
         return
-    table = Table("machines", "cores", "PSS, MB", "latency 50 / 99 / 100 %, ms", "reports", "missed", "lost samples")
+    titles = "machines", "cores", "ms per window", "PSS, MB", "latency 50 / 99 / 100 %, ms", "reports", "missed"
+    table = Table(*titles, "lost samples", "history, kB")
     for each in figures:
         latency = f"{each.latency_median_ms:.0f} / {each.latency_99_ms:.0f} / {each.latency_max_ms:.0f}"
         row = (
             each.machines,
             f"{each.cores:.2f}",
+            f"{each.ms_per_window:.1f}",
             f"{each.pss_mb:.0f}",
             latency,
             each.reports,
             each.windows_missed,
             each.samples_lost,
+            f"{each.history_bytes / 1e3:.0f}",
         )
         table.add_row(*map(str, row))
     grown = ", ".join(f"{name} {value:.2f}" for name, value in exponents(figures).items())

@@ -11,12 +11,14 @@ def figures(machines: int) -> HallFigures:
     return HallFigures(
         machines=machines, seconds=30.0, cores=0.01 * machines, cores_of_each=(), pss_mb=3.0 * machines**0.5,
         pss_of_each_mb=(), threads=1, latency_median_ms=20.0, latency_99_ms=50.0, latency_max_ms=90.0, reports=10,
-        windows_missed=0, samples_lost=0,
+        windows_missed=0, samples_lost=0, ms_per_window=20.0, history_bytes=100 * machines,
     )  # fmt: skip
 
 
 def test_exponents_say_how_costs_grow_with_machines() -> None:
-    assert exponents([figures(20), figures(50), figures(100)]) == pytest.approx({"cores": 1.0, "pss_mb": 0.5})
+    assert exponents([figures(20), figures(50), figures(100)]) == pytest.approx(
+        {"cores": 1.0, "pss_mb": 0.5, "history_bytes": 1.0}
+    )
     assert exponents([figures(20)]) == {}
 
 

@@ -132,26 +132,29 @@ class Ring:
         Samples before ``read_until`` (s) are marked as read: if they are overwritten, they are not lost.
         """
         self._gather()
-        times, values = self._ordered()
-        first, last = (int(index) for index in np.searchsorted(times, (start, end)))
-        before = np.flatnonzero(np.isfinite(values[:first]))
+        parts = []
+        for times, values in reversed(self._ordered()):
+            first, last = (int(index) for index in np.searchsorted(times, (start, end)))
+            parts.append((times[first:last], values[first:last]))
+            if first > 0 and (latest := _last_finite(values[:first])) is not None:
+                before = slice(latest, latest + 1)
+                parts.append((times[before], values[before]))
+                break
         self._read_up_to = max(self._read_up_to, read_until)
-        part = slice(int(before[-1]), int(before[-1]) + 1) if len(before) else slice(0, 0)
-        both = (np.concatenate([column[part], column[first:last]]) for column in (times, values))
+        both = (np.concatenate([part[column] for part in reversed(parts)]) for column in (0, 1))
         return next(both), next(both)
 
-    def _ordered(self) -> tuple[Array, Array]:
-        """Return all samples, sorted by time."""
+    def _ordered(self) -> list[tuple[Array, Array]]:
+        """Return all samples, sorted by time: as they are in the ring, before its end and after its beginning."""
         capacity = len(self._times)
-        if self._count <= capacity:
-            times, values = self._times[: self._count], self._values[: self._count]
-        else:
-            oldest = self._count % capacity
-            times, values = np.roll(self._times, -oldest), np.roll(self._values, -oldest)
-        if self._unordered_until > self._count - len(times):
+        oldest = self._count % capacity if self._count > capacity else 0
+        slices = [slice(oldest, min(self._count, capacity)), slice(0, oldest)]
+        parts = [(self._times[part], self._values[part]) for part in slices]
+        if self._unordered_until > max(self._count - capacity, 0):
+            times, values = (np.concatenate(column) for column in zip(*parts, strict=True))
             order = np.argsort(times, kind="stable")
-            return times[order], values[order]
-        return times, values
+            return [(times[order], values[order])]
+        return parts
 
     def first_time(self) -> float:
         """Return the time of the oldest sample still held, s; infinity if there is none."""
@@ -163,6 +166,14 @@ class Ring:
         if self._new_times:
             return self._new_times[-1]
         return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
+
+
+def _last_finite(values: Array) -> int | None:
+    """Return where the last finite one of ``values`` (n,) is: nearly always at the end, so all are looked at last."""
+    if len(values) and math.isfinite(values[-1]):
+        return len(values) - 1
+    finite = np.flatnonzero(np.isfinite(values))
+    return int(finite[-1]) if len(finite) else None
 
 
 class Rings:

@@ -525,20 +525,23 @@ class Service:
     def _log(self, document: ReportDocument, now: float) -> str:
         """Log the events that the window changed, and run the command for those that are not silent.
 
-        A window is logged once per hour, in a terminal each of a machine that is alone. Returns its line.
+        A window is logged once per hour, in a terminal each of a machine that is alone. Returns its line if the machine
+        is alone.
         """
         for event in announcements(document):
             level = logging.ERROR if event.is_urgent else logging.WARNING
             log.log(logging.INFO if event.is_silent else level, "%s", event_text(event, details=True))
             if not event.is_silent:
                 self._command.run(event)
-        line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
-        short, self._logged = summary(document, self._logged), document
+        is_due, is_alone = now - self._summarised_at >= SUMMARY_INTERVAL, self._shared is None
+        before, self._logged = self._logged, document
         self._summarised_at = now if is_due else self._summarised_at
         if is_due and self.publisher is not None:
             self._warn_of_expiry(self.publisher, datetime.now(UTC))
-        is_shown = is_due or (self._shared is None and sys.stderr.isatty())
-        log.log(logging.INFO if is_shown else logging.DEBUG, "%s", line if is_due else short)
+        line = summary(document) if is_due or is_alone else ""
+        level = logging.INFO if is_due or (is_alone and sys.stderr.isatty()) else logging.DEBUG
+        if log.isEnabledFor(level):
+            log.log(level, "%s", line if is_due else summary(document, before))
         return line
 
     def _warn_of_expiry(self, publisher: Publisher, now: datetime) -> None:
