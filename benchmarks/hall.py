@@ -8,8 +8,8 @@ moment at which all workers are ready: processor time and memory (PSS, of all it
 (from the end of a window until it is published), the windows that were missed, and by how much the histories grow.
 Exponents say how the costs grow with the number of machines.
 
-A computer that is busy with something else delays reports and lets windows be missed; processor time for each window
-that was due, memory and bytes are the same on it.
+A computer that is busy with something else delays reports and lets windows be missed. Memory is the same on it, and
+while no window is missed also bytes and the processor time for each window.
 """
 
 import contextlib
