@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
@@ -155,51 +155,64 @@ def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, 
         daemon = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - our own command
         try:
             with Subscriber(Connection((endpoint,)), received.put):
-                _wait_for_all(received, machines, daemon)
+                known = _wait_for_all(received, machines, daemon)
                 time.sleep(SETTLING)
-                return _measured(daemon, received, machines, seconds, state)
+                known |= {document.machine: document for document in _taken(received)}
+                return _measured(daemon, received, known, seconds, state)
         finally:
             daemon.send_signal(signal.SIGTERM)
             daemon.wait(timeout=60)
 
 
-def _wait_for_all(received: "queue.SimpleQueue[str]", machines: int, daemon: "subprocess.Popen[bytes]") -> None:
-    """Wait until each machine has a report."""
-    deadline, seen = time.monotonic() + PATIENCE, set[str]()
+def _taken(received: "queue.SimpleQueue[str]") -> list[ReportDocument]:
+    """Return the reports that were received until now."""
+    return [ReportDocument.from_json(received.get()) for _ in range(received.qsize())]
+
+
+def _wait_for_all(
+    received: "queue.SimpleQueue[str]", machines: int, daemon: "subprocess.Popen[bytes]"
+) -> dict[str, ReportDocument]:
+    """Wait until each machine has a report, and return the last one of each."""
+    deadline, seen = time.monotonic() + PATIENCE, dict[str, ReportDocument]()
     while len(seen) < machines:
         if daemon.poll() is not None or time.monotonic() > deadline:
             raise SystemExit(f"only {len(seen)} of {machines} machines have reports")
         with contextlib.suppress(queue.Empty):
-            seen.add(ReportDocument.from_json(received.get(timeout=1.0)).machine)
+            document = ReportDocument.from_json(received.get(timeout=1.0))
+            seen[document.machine] = document
+    return seen
 
 
 def _measured(
-    daemon: "subprocess.Popen[bytes]", received: "queue.SimpleQueue[str]", machines: int, seconds: float, state: Path
+    daemon: "subprocess.Popen[bytes]",
+    received: "queue.SimpleQueue[str]",
+    known: Mapping[str, ReportDocument],
+    seconds: float,
+    state: Path,
 ) -> HallFigures:
+    """Measure for so long; ``known`` has the last report of each machine before."""
     root = psutil.Process(daemon.pid)
     tree = [root, *root.children(recursive=True)]
-    spent, begun, first = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic(), received.qsize()
+    spent, begun = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic()
     bytes_before = _history_bytes(state)
     time.sleep(seconds)
     elapsed = time.monotonic() - begun
     cores = tuple((sum(each.cpu_times()[:2]) - one) / elapsed for each, one in zip(tree, spent, strict=True))
     memory = [pss(each) for each in tree]
-    documents = [ReportDocument.from_json(received.get()) for _ in range(received.qsize())]
-    earlier = {document.machine: document.counters for document in documents[:first]}
-    documents = documents[first:]
+    documents = _taken(received)
     latencies = np.array([document.cost.latency_s for document in documents], dtype=np.float64) * 1e3
     last = {document.machine: document.counters for document in documents}
+    pairs = [(known[name].counters, counters) for name, counters in last.items()]
 
     def rise(of: Callable[[CountersDocument], int]) -> int:
-        before = sum(of(each) for each in earlier.values() if each is not None)
-        return sum(of(each) for each in last.values() if each is not None) - before
+        return sum(of(after) - of(before) for before, after in pairs if before is not None and after is not None)
 
     return HallFigures(
-        machines=machines,
+        machines=len(known),
         seconds=elapsed,
         cores=sum(cores),
         cores_of_each=cores,
-        ms_per_window=sum(cores) * 1e3 * WINDOW / machines,
+        ms_per_window=sum(cores) * 1e3 * WINDOW / len(known),
         pss_mb=sum(memory),
         pss_of_each_mb=tuple(memory),
         threads=root.num_threads(),
