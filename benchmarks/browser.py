@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,8 +100,8 @@ class Browser:
 
 
 @contextmanager
-def browser(path: str) -> Iterator[Browser]:
-    """A browser that ends with the block; ``path`` as :func:`program` returns it."""
+def browser(path: str, flags: Sequence[str] = ()) -> Iterator[Browser]:
+    """A browser that ends with the block; ``path`` as :func:`program` returns it, ``flags`` are further ones."""
     theirs_in, commands = os.pipe()
     replies, theirs_out = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -109,7 +109,7 @@ def browser(path: str) -> Iterator[Browser]:
         script = (
             f"import os, sys; os.dup2({theirs_in}, 3); os.dup2({theirs_out}, 4); os.execv(sys.argv[1], sys.argv[1:])"
         )
-        command = [sys.executable, "-c", script, path, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+        command = [sys.executable, "-c", script, path, *FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"]
         with subprocess.Popen(  # noqa: S603 - a browser of this computer
             command, pass_fds=(theirs_in, theirs_out), stderr=subprocess.DEVNULL
         ) as process:

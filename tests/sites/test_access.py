@@ -14,6 +14,7 @@ from urllib.parse import urlencode
 
 import psutil
 import pytest
+from benchmarks.browser import browser, program
 
 from otolith.health.limits import Level
 from otolith.health.notes import OperatorNote
@@ -173,6 +174,27 @@ def test_a_page_of_another_site_sends_nothing(anna: Served, daemon: Daemon, head
     without = anna.ask(path, "POST", urlencode(fields).encode())
     assert without.status == 403
     assert notes_of(daemon) == before
+
+
+SENT = """(() => {
+    const form = document.createElement("form");
+    form.method = "post"; form.action = "/command";
+    document.body.append(form); form.submit();
+})()"""
+
+
+def test_a_browser_says_which_page_sends_a_form(anna: Served) -> None:
+    """Without a certificate the form is refused for that, so not because of the page that sends it."""
+    if (path := program()) is None:
+        pytest.skip("no browser: apt install chromium")
+    with browser(path, ["--ignore-certificate-errors"]) as tab:
+        for page in ("", PAGE.removeprefix("/")):
+            tab.open(f"{anna.address}{page}", 1280, 720)
+            tab.value(SENT)
+            wait_for(lambda: words_in("en")["order_user"] in str(tab.value("document.body.innerText")))
+        tab.open(f"data:text/html,<form method=post action={anna.address}command>", 1280, 720)
+        tab.value("document.forms[0].submit()")
+        wait_for(lambda: "of this site only" in str(tab.value("document.body.innerText")))
 
 
 @pytest.mark.parametrize("field", ["site", "machine", "event", "kind", "id", "at", "token"])
