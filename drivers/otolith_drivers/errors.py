@@ -11,10 +11,11 @@ raised where the fault is detected; only ``otolith.__main__`` prints it, as one 
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 
 MAX_NAMES = 12  # names of messages, arbitration IDs or signals in a line
+MAX_NEAREST = 5  # names of many that are shown for one that is not among them
 
 
 def installation_of(extra: str) -> str:
@@ -72,13 +73,26 @@ def some_names(names: Sequence[str]) -> str:
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """Return a hint for a misspelt ``word``: the most similar known name, or the list of known names."""
+    """Return a hint for a misspelt ``word``: the most similar known name, or the known names, the nearest few of many.
+
+    Numbers, as those of registers, are near each other by their difference.
+    """
     import difflib  # noqa: PLC0415 - only needed for an error
 
+    if word.isdecimal() and known and all(name.isdecimal() for name in known):
+        return _names(known, lambda name: abs(int(name) - int(word)))
     by_folded_name = {name.casefold(): name for name in known}
     similar = difflib.get_close_matches(word, known, n=1) or [
         by_folded_name[name] for name in difflib.get_close_matches(word.casefold(), list(by_folded_name), n=1)
     ]
     if similar:
         return f"did you mean {similar[0]!r}?"
+    folded = word.casefold()
+    return _names(known, lambda name: -difflib.SequenceMatcher(None, folded, name.casefold()).ratio())
+
+
+def _names(known: Sequence[str], distance: Callable[[str], float]) -> str:
+    """Return all names in order if they are few; else those with the least ``distance``, and how many there are."""
+    if len(known) > MAX_NAMES:
+        return f"nearest of {len(known)} names: {', '.join(sorted(known, key=distance)[:MAX_NEAREST])}"
     return f"known: {', '.join(sorted(known))}" if known else "there are none"

@@ -185,19 +185,19 @@ def test_no_file_is_overwritten_without_being_told(tmp_path: Path, scenario: Mot
 def test_a_refused_answer_leaves_no_file(tmp_path: Path, scenario: MotorScenario) -> None:
     data, file = german(tmp_path / "montag.csv", scenario, UNITS_IN_A_LINE, 300), tmp_path / "new.toml"
     for answers, words in {
-        ("--noise", "i=5 V"): ("noise.i", "V"),
+        ("--noise", "i=5 V"): ("--noise i", "V"),
         ("--signal", "i=Drehzahl"): ("i", "Drehzahl", "1/min"),
         ("--signal", "i=Anker"): ("Anker", "Ankerstrom"),
-        ("--signal", "j=Ankerstrom"): ("dc_motor", "j"),
+        ("--signal", "j=Ankerstrom"): ("--signal j", "'j'"),
         ("--unit", "Drehzahl=furlong/moon"): ("Drehzahl", "furlong/moon"),
         ("--unknown", "T_load=steady"): ("T_load", "steady", "constant", "friction"),
         ("--twin", "pmsm"): ("pmsm", "i_q", "--signal"),
-        ("--sample-period", "fast"): ("Sample period", "fast"),
-        ("--window", "2 V"): ("window", "V", "s"),
-        ("--name", "winch 1"): ("machine", "winch 1"),
+        ("--sample-period", "fast"): ("--sample-period", "fast"),
+        ("--window", "2 V"): ("--window", "V", "s"),
+        ("--name", "winch 1"): ("--name", "winch 1"),
         ("--scale", "Drehzal=2"): ("Drehzal", "Drehzahl"),
         ("--scale", "Kanal=1=2"): ("'Kanal=1'",),
-        ("--noise", "j=5 mA"): ("noise", "j"),
+        ("--noise", "j=5 mA"): ("--noise", "j"),
     }.items():
         with raises_saying(ConfigurationError, *words):
             otolith("init", file, "--csv", data, *answers)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asyncua import Client
+from click import UsageError
 
 from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.displays import with_displays
@@ -273,6 +274,42 @@ def test_a_source_that_is_not_there_leaves_no_file(tmp_path: Path) -> None:
         with pytest.raises(DeviceError, match=str(port)):
             otolith("init", tmp_path / "new.toml", kind, target.format(port), "--seconds", 0.3)
     assert list(tmp_path.glob("*.toml")) == []
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--twin", "dc_motr"), ("dc_motor",)),
+        (("--twin", "dc_motor", "--signal", "speed=103"), ("--signal", "speed")),
+        (("--signal", "omga=103"), ("--signal", "omga", "omega")),
+        (("--unknown", "T_load=steady"), ("--unknown", "steady", "constant", "friction")),
+        (("--unknown", "omega=constant"), ("--unknown", "omega", "T_load")),
+        (("--unit", "103=rqm"), ("--unit", "103", "rqm")),
+        (("--twin", "dc_motor", "--signal", "omega=103", "--unit", "103=V"), ("omega", "103", "V", "rad/s")),
+        (("--scale", "103=fast"), ("--scale", "103", "fast")),
+        (("--scale", "103=0"), ("--scale", "103", "0")),
+        (("--noise", "omga=1 rpm"), ("--noise", "omga", "omega")),
+        (("--noise", "omega=1 V"), ("--noise", "omega", "V", "rad/s")),
+        (("--display", "omga=1450 rpm"), ("--display", "omga", "omega")),
+        (("--twin", "dc_motor", "--display", "omega=1450"), ("--display", "omega", "unit", "rad/s")),
+        (("--sample-period", "10"), ("--sample-period", "10", "s")),
+        (("--window", "2 days"), ("--window", "2 days")),
+        (("--name", "my drive"), ("--name", "my drive")),
+        (("--site", "hall 3"), ("--site", "hall 3")),
+        (("--signal", "omega=speed"), ("--signal", "omega", "speed", "register")),
+        (("--signal", "omega=64"), ("--signal", "omega", "64", "0 to 63", "--registers")),
+        (("--commission",), ("--commission", "--csv")),
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_option_is_told_before_the_bus_is_read(
+    option: tuple[str, ...], words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Nothing listens at the port, so that a command that reads first fails for another reason."""
+    target = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    with pytest.raises((ConfigurationError, UsageError)) as caught:
+        otolith("init", tmp_path / "new.toml", "--modbus", target, *option)
+    assert_says(str(caught.value), *words)
 
 
 def test_a_port_that_is_closed_is_told_at_once(tmp_path: Path) -> None:

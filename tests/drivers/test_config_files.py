@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 
 from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from tests.messages import assert_refuses
+from tests.messages import assert_refuses, assert_says
 
 
 class Inner(StrictModel):
@@ -130,3 +130,16 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
 )
 def test_nearest_name_ignores_case(word: str, hint: str) -> None:
     assert nearest(word, ["modbus", "can"]) == hint
+
+
+@pytest.mark.parametrize(
+    ("word", "names", "near"),
+    [
+        ("120", [str(number) for number in range(400)], {"118", "119", "120", "121", "122"}),
+        ("Umdrehungen", [f"Kanal{number:03}" for number in range(400)] + ["Drehzahl"], {"Drehzahl"}),
+    ],
+)
+def test_of_many_names_the_nearest_few_are_shown(word: str, names: list[str], near: set[str]) -> None:
+    hint = nearest(word, [name for name in names if name != word])
+    assert_says(hint, *near - {word})
+    assert sum(name in hint for name in names if len(name) > 2) <= 6

@@ -1,5 +1,7 @@
 """What ``otolith init`` proposes and asks, from a source to the file: units, twin, signals, window."""
 
+import contextlib
+import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,7 +10,7 @@ from pathlib import Path
 
 from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, rank
-from otolith.cli.commissioning.draft.displays import with_displays
+from otolith.cli.commissioning.draft.displays import displayed, with_displays
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
 from otolith.cli.commissioning.draft.questions import Questions
 from otolith.cli.commissioning.draft.words import usual_unit
@@ -38,15 +40,96 @@ ASSUMPTIONS = [kind.value for kind in Assumption if kind is not Assumption.PROPO
 MAX_SHOWN = 40  # rows of the table of offers
 
 
-def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: Questions) -> None:
-    """Show what ``source`` offers, choose, ask, and write ``file``.
+def check_answers(answers: Answers) -> None:
+    """Check what options have answered as far as no source is needed.
 
     Raises:
-        ConfigurationError: no twin fits, or an answer is none.
+        ConfigurationError: a name, unit, number or quantity is none, or no twin can have it.
+    """
+    twins = [find_twin(name) for name in ([answers.twin] if answers.twin else library_twins())]
+    fitting = _twins_with(answers, twins)
+    _check_unknown(answers, fitting)
+    _check_numbers(answers, fitting)
+    if answers.displays:
+        displayed(answers, twins)
+    for signal, source in answers.signals.items():
+        units = [twin.unit_of(signal) for twin in fitting]
+        unit = answers.units.get(source, units[0])
+        _checked(f"--signal {signal}={source} --unit {source}", unit, [_fitting(target) for target in units])
+    for option, text, check in (
+        ("--sample-period", answers.sample_period, _seconds),
+        ("--window", answers.window, _seconds),
+        ("--name", answers.name, check_name),
+        ("--site", answers.site, check_name),
+    ):
+        if text is not None:
+            _checked(option, text, [check])
+
+
+def _check_unknown(answers: Answers, fitting: Sequence[Definition]) -> None:
+    """Raise ConfigurationError for an input without a sensor that no twin has, or an assumption that there is not."""
+    inputs = dict.fromkeys(row.name for twin in fitting for row in twin.inputs)
+    for name, kind in answers.unknown.items():
+        if name not in inputs:
+            raise ConfigurationError(f"--unknown {name}={kind}: no input of the twin: {nearest(name, list(inputs))}")
+        if kind not in ASSUMPTIONS:
+            raise ConfigurationError(f"--unknown {name}={kind}: {nearest(kind, ASSUMPTIONS)}")
+
+
+def _check_numbers(answers: Answers, fitting: Sequence[Definition]) -> None:
+    """Raise ConfigurationError for a unit, scale or noise level that is none."""
+    for name, unit in answers.units.items():
+        if not is_unit(unit):
+            raise ConfigurationError(f"--unit {name}={unit}: {unit!r} is no unit: write it like V, 1/min or N*m")
+    for name in answers.scales:
+        _scale(name, answers)
+    for name, level in answers.noises.items():
+        units = [twin.unit_of(name) for twin in fitting if name in twin.signals]
+        _checked(f"--noise {name}", level, [Quantity(unit, low=0.0, difference=True) for unit in units])
+
+
+def _twins_with(answers: Answers, twins: Sequence[Definition]) -> list[Definition]:
+    """Return the twins with all signals that are told; raise ConfigurationError if there is none."""
+    named = dict.fromkeys(answers.signals, "--signal") | dict.fromkeys(answers.unknown, "--unknown")
+    named |= dict.fromkeys(answers.noises, "--noise")
+    fitting = [twin for twin in twins if named.keys() <= set(twin.signals)]
+    if fitting:
+        return fitting
+    known = dict.fromkeys(name for twin in twins for name in twin.signals)
+    for name, option in named.items():
+        if name not in known:
+            who = f"twin {twins[0].name}" if len(twins) == 1 else "no twin"
+            has = "has no" if len(twins) == 1 else "has a"
+            raise ConfigurationError(f"{option} {name}: {who} {has} signal {name!r}: {nearest(name, list(known))}")
+    remedy = "'otolith twin list' shows the twins, 'otolith twin show NAME' the signals of one"
+    raise ConfigurationError(f"{', '.join(f'{option} {name}' for name, option in named.items())}: no twin has all "
+                             f"of these signals: {remedy}")  # fmt: skip
+
+
+def _checked(option: str, text: str, checks: Sequence[Callable[[str], object]]) -> None:
+    """Raise ConfigurationError, which names ``option``, if none of ``checks`` takes ``text``."""
+    faults = []
+    for check in checks:
+        try:
+            check(text)
+        except ValueError as error:
+            faults.append(error)
+        else:
+            return
+    raise ConfigurationError(f"{option}={text}: {faults[0]}") from faults[0]
+
+
+def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: Questions) -> None:
+    """Show what ``source`` offers, choose, ask, and write ``file``; the answers are checked.
+
+    Raises:
+        ConfigurationError: no twin fits, or the source has no signal that an answer names.
     """
     writable = [offer for offer in source.offers if not CONTROL.search(offer.name)]
-    answers = with_displays(answers, writable, [find_twin(name) for name in library_twins()])
-    offers = with_units(writable, answers.units)
+    answers = with_displays(answers, writable, [find_twin(name) for name in library_twins()], source.still)
+    for named in (*answers.signals.values(), *answers.units, *answers.scales):
+        _check_offered(named, source, writable)
+    offers = [replace(offer, unit=answers.units.get(offer.name, offer.unit)) for offer in writable]
     _show(source, offers)
     if hidden := [offer.name for offer in source.offers if offer not in writable]:
         echo(f"! no machine file can name {', '.join(hidden)}: rename what has control characters", "")
@@ -93,20 +176,15 @@ def next_lines(file: Path, source: OfferedSource, *, is_commissioned: bool) -> I
     yield f"then: otolith replay {name} {log} --report {page}"
 
 
-def with_units(offers: Sequence[Offer], units: Mapping[str, str]) -> list[Offer]:
-    """Return the offers with units by their names; raise ConfigurationError for another name or no unit."""
-    known = {offer.name: offer for offer in offers}
-    for name, unit in units.items():
-        _offer_named(name, known)
-        if not is_unit(unit):
-            raise ConfigurationError(f"--unit {name}={unit}: {unit!r} is no unit: write it like V, 1/min or N*m")
-    return [replace(offer, unit=units.get(offer.name, offer.unit)) for offer in offers]
-
-
-def _offer_named(name: str, known: Mapping[str, Offer]) -> Offer:
-    if name not in known:
-        raise ConfigurationError(f"the source has no signal {name!r}: {nearest(name, list(known))}")
-    return known[name]
+def _check_offered(name: str, source: OfferedSource, offers: Sequence[Offer]) -> None:
+    """Raise ConfigurationError, with the reason, if the source does not offer a signal ``name``."""
+    known = [offer.name for offer in offers]
+    if name in known:
+        return
+    if name in source.still:
+        held = f"{name} held {source.still[name]:g} all the time, so that it does not show what it is"
+        raise ConfigurationError(f"{held}: let the machine move, or write its line of [signals] by hand")
+    raise ConfigurationError(f"the source has no signal {name!r} that changes: {nearest(name, known)}")
 
 
 def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
@@ -129,7 +207,7 @@ def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
 def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, questions: Questions) -> TwinProposal:
     """Return the twin that fits best, or the one that was told; raise ConfigurationError if none fits."""
     known = {offer.name: offer for offer in offers}
-    given = {signal: _offer_named(text, known) for signal, text in answers.signals.items()}
+    given = {signal: known[text] for signal, text in answers.signals.items()}
     twins, told = [find_twin(name) for name in library_twins()], given.keys() | answers.unknown.keys()
     having = [twin for twin in twins if told <= set(twin.signals)] or twins
     ranked = rank(having, offers, source.title, given, answers.unknown)
@@ -140,7 +218,7 @@ def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, ques
     twin = find_twin(name)
     for signal in [*answers.signals, *answers.unknown]:
         if signal not in twin.signals:
-            raise ConfigurationError(f"twin {name} has no signal {signal!r}: it has {', '.join(twin.signals)}")
+            raise ConfigurationError(f"twin {name} has no signal {signal!r}: {nearest(signal, list(twin.signals))}")
     for signal, offer in given.items():
         _check_unit(twin, signal, offer, offer.unit or twin.unit_of(signal))
     proposal = propose(twin, offers, given, answers.unknown)
@@ -159,8 +237,6 @@ def _signals(
     """Return the signals that the source has, and the inputs that nothing measures with what is assumed of them."""
     known = {offer.name: offer for offer in offers}
     twin, read, assumed = proposal.twin, dict[str, ReadSignal](), dict[str, str]()
-    for name in answers.scales:
-        _offer_named(name, known)
     for name in dict.fromkeys(twin.signals):
         what = f"{name} [{twin.unit_of(name)}], {meaning_of(twin, name)}"
         pair = proposal.pairs.get(name)
@@ -198,20 +274,15 @@ def _one_of(known: Mapping[str, Offer], allowed: Sequence[str]) -> Callable[[str
 def _read(twin: Definition, name: str, offer: Offer, why: str, answers: Answers, questions: Questions) -> ReadSignal:
     """Return a signal with its unit; raise ConfigurationError if it is of another quantity, or the scale no number."""
     target = twin.unit_of(name)
-
-    def fitting(unit: str) -> str:
-        factor(unit, target)
-        return unit
-
     unit = offer.unit
     if unit is None:
         usual = usual_unit(offer.name)
         is_fitting = usual is not None and target == "rad/s"
-        unit = questions.text(f"Unit of {offer.name}", usual if usual and is_fitting else target, fitting)
+        unit = questions.text(f"Unit of {offer.name}", usual if usual and is_fitting else target, _fitting(target))
         if not questions.asks:
             why = f"{why}; the unit is assumed, --unit {offer.name}=UNIT states it".removeprefix("; ")
     _check_unit(twin, name, offer, unit)
-    scale = {"scale": _number(answers.scales[offer.name])} if offer.name in answers.scales else {}
+    scale = {"scale": _scale(offer.name, answers)} if offer.name in answers.scales else {}
     return ReadSignal(offer, unit, why, scale)
 
 
@@ -222,12 +293,23 @@ def _check_unit(twin: Definition, name: str, offer: Offer, unit: str) -> None:
         raise ConfigurationError(f"{name} from {offer.name}: {error}") from error
 
 
-def _number(text: str) -> float:
-    """Return the number that a scale is; raise ConfigurationError for another text."""
-    try:
-        return float(text)
-    except ValueError as error:
-        raise ConfigurationError(f"--scale {text!r}: no number") from error
+def _fitting(target: str) -> Callable[[str], str]:
+    """Return a check that raises ValueError for a unit that is none of the quantity with the unit ``target``."""
+
+    def check(unit: str) -> str:
+        factor(unit, target)
+        return unit
+
+    return check
+
+
+def _scale(name: str, answers: Answers) -> float:
+    """Return the scale of a signal of the source; raise ConfigurationError for what is none."""
+    text = answers.scales[name]
+    with contextlib.suppress(ValueError):
+        if math.isfinite(scale := float(text)) and scale != 0.0:
+            return scale
+    raise ConfigurationError(f"--scale {name}={text}: write a number other than 0, like 0.01")
 
 
 def _seconds(text: str) -> str:

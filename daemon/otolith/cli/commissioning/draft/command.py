@@ -112,7 +112,7 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
             "what is the source? --csv, --dbc (with --log or --channel), --modbus, --opcua or --mqtt"
         )
     target = str(options[kind] if given else click.prompt("its file or address"))
-    _check_options(kind, options, answers)
+    answers = _checked(kind, options, answers, commissions=commissions)
     stop = StopSignal()
     try:
         source = _source(kind, target, options, file.parent, stop)
@@ -126,12 +126,27 @@ def init(file: Path, ask: bool | None, force: bool, commissions: bool, **options
     return 0
 
 
-def _check_options(kind: str, options: dict[str, Any], answers: "Answers") -> None:
-    """Raise UsageError for an option that is not of the ``kind`` of source."""
+def _checked(kind: str, options: dict[str, Any], answers: "Answers", *, commissions: bool) -> "Answers":
+    """Return the answers, with the names of registers as the device offers them; nothing is read before.
+
+    Raises:
+        UsageError: an option is not of the ``kind`` of source.
+        ConfigurationError: an answer is none.
+    """
+    from otolith.cli.commissioning.draft.choosing import check_answers
+
     if (options["log"] is not None or options["no_bus"]) and kind != "dbc":
         raise click.UsageError("--log and --no-bus need --dbc, the database of the frames")
     if answers.displays and kind != "modbus":
         raise click.UsageError("--display is for registers of --modbus; --signal and --unit tell it of other sources")
+    if commissions and not (kind == "csv" or options["log"] is not None):
+        raise click.UsageError("--commission needs a log: --csv, or --dbc with --log")
+    check_answers(answers)
+    if kind != "modbus":
+        return answers
+    from otolith.cli.commissioning.draft import network
+
+    return network.with_registers(answers, options["registers"], network.driver_keys(options["keys"]))
 
 
 def _finish(
@@ -143,8 +158,6 @@ def _finish(
     from otolith.cli.commissioning.draft.choosing import next_lines, write_draft
     from otolith.machine import load_machine
 
-    if commissions and not source.check:
-        raise click.UsageError("--commission needs a log: --csv, or --dbc with --log")
     write_draft(file, source, answers, questions)
     if commissions:
         decide = (

@@ -12,7 +12,7 @@ what was read, and the moment with the closest ones says which registers they ar
 import contextlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -47,23 +47,37 @@ MOMENTS = 100  # at most, into which the readings are divided
 NUMBER = re.compile(r"\s*([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)")  # The unit may follow without a blank
 
 
-def with_displays(answers: Answers, offers: Sequence[Offer], twins: Sequence[Definition]) -> Answers:
+def displayed(answers: Answers, twins: Sequence[Definition]) -> tuple[Definition, dict[str, tuple[float, str]]]:
+    """Return the twin whose signals are displayed, and numbers and units of the displayed values, by signal.
+
+    Raises:
+        ConfigurationError: no twin has these signals, or a value is none.
+    """
+    twin = _twin_of(answers, twins)
+    return twin, {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
+
+
+def with_displays(
+    answers: Answers, offers: Sequence[Offer], twins: Sequence[Definition], still: Mapping[str, float] | None = None
+) -> Answers:
     """Return the answers with twin, signals, units and scales that follow from displayed values; told ones stay.
+
+    ``still`` is what registers hold that never changed, by name: they are not chosen, but named where they fit.
 
     Raises:
         ConfigurationError: a value is none, or no register can have it.
     """
     if not answers.displays:
         return answers
-    twin = _twin_of(answers, twins)
-    shown = {name: _quantity(twin, name, text) for name, text in answers.displays.items()}
+    twin, shown = displayed(answers, twins)
     names = [name for name in shown if name not in answers.signals]
     values, moments = [shown[name] for name in names], _moments(offers)
     moves = [_moves(track) for track in zip(*moments, strict=True)]
     fits = [_Fit(moment, values, offers, answers.units, moves) for moment in moments]
     best = min(fits, key=lambda fit: fit.cost)
     if lost := [f"{names[at]}={answers.displays[names[at]]}" for at in range(len(names)) if at not in best.found]:
-        raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(offers)}")
+        absent = [values[at] for at in range(len(names)) if at not in best.found]
+        raise ConfigurationError(f"--display {', '.join(lost)}: {_not_found(absent, offers, still or {})}")
     signals, units, scales = dict(answers.signals), dict(answers.units), dict(answers.scales)
     as_good = [fit for fit in fits if fit.cost <= best.cost + AS_CLOSE]
     for at, place in best.found.items():
@@ -193,8 +207,13 @@ def _other_units(unit: str) -> tuple[str, ...]:
     return ()
 
 
-def _not_found(offers: Sequence[Offer]) -> str:
-    """Return why no register can have a displayed value, and what to do."""
+def _not_found(absent: Sequence[tuple[float, str]], offers: Sequence[Offer], still: Mapping[str, float]) -> str:
+    """Return why no register can have the ``absent`` values, and what to do."""
+    fitting = [name for name, held in still.items() if any(_distance(value, held) <= CLOSE for value, _ in absent)]
+    if fitting:
+        which = f"register {', '.join(fitting)}, which never changed, so that it may as well be a set-point or a limit"
+        remedy = "let the machine change its speed in a cycle, take a photo of the display, and read for a whole cycle"
+        return f"it fits only {which}: {remedy} by --seconds 30"
     ends = [(row.name, float(row.values.min()), float(row.values.max())) for row in offers if len(row.values)]
     held = ", ".join(f"{name}: {low:.5g} to {high:.5g}" for name, low, high in ends) or "none"
     fault = f"no register of its own holds it times a power of ten together with the other values ({held})"
@@ -210,11 +229,25 @@ def _twin_of(answers: Answers, twins: Sequence[Definition]) -> Definition:
     else:
         fitting = [twin for twin in twins if {row.name for row in twin.outputs} <= names <= set(twin.signals)]
     if not fitting:
-        known = ", ".join(f"{twin.name}: {', '.join(twin.signals)}" for twin in twins)
-        raise ConfigurationError(
-            f"--display {', '.join(sorted(names))}: no twin has these outputs; signals are {known}"
-        )
+        raise ConfigurationError(f"--display {', '.join(sorted(answers.displays))}: {_without_twin(names, twins)}")
     return min(fitting, key=lambda twin: (len(twin.signals), len(twin.parameters)))
+
+
+def _without_twin(names: Collection[str], twins: Sequence[Definition]) -> str:
+    """Return why no twin has all of its outputs, and no other signals, in ``names``; and what to do."""
+    known = dict.fromkeys(name for twin in twins for name in twin.signals)
+    if unknown := [name for name in names if name not in known]:
+        return f"no twin has a signal {unknown[0]!r}: {nearest(unknown[0], list(known))}"
+
+    def missing(twin: Definition) -> list[str]:
+        return [row.name for row in twin.outputs if row.name not in names]
+
+    closest = min(twins, key=lambda twin: (len(set(names) - set(twin.signals)), len(missing(twin))))
+    if lacks := missing(closest):
+        remedy = f"give --display or --signal also of {', '.join(lacks)}"
+        return f"no twin has these outputs alone; the nearest, {closest.name}, needs more: {remedy}, or another --twin"
+    foreign = ", ".join(sorted(set(names) - set(closest.signals)))
+    return f"no twin has all of these signals; the nearest, {closest.name}, has no {foreign}: leave it out"
 
 
 def _quantity(twin: Definition, name: str, text: str) -> tuple[float, str]:

@@ -1,16 +1,19 @@
 """What a Modbus device, an OPC UA server and an MQTT broker offer. All are only read."""
 
 import asyncio
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from otolith.cli.commissioning.draft.answers import Answers
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource, unit_in
 from otolith.cli.commissioning.draft.writing import USUAL_PERIOD
-from otolith.cli.commissioning.probe import address_keys, opened_server, read_registers
+from otolith.cli.commissioning.probe import NUMBER, address_keys, opened_server, read_registers
 from otolith.cli.common import StopSignal, progress_line
 from otolith_drivers.base import find_driver
 from otolith_drivers.config_files import validated
@@ -42,11 +45,9 @@ def device_offers(
 
     line = {name: value for name, value in keys.items() if name not in ADDRESSING}
     options = validated(address_keys(target) | line, LineOptions, ())
-    device, base = (_whole(keys, name, default) for name, default in zip(ADDRESSING, (1, 0), strict=True))
+    device, base = _whole(keys, "device", 1), _whole(keys, "first_address", 0)
     place = Place(options, device, "holding" if table == "holding" else "input", base)
-    first, last = registers or (base, base + 63)
-    if first < base:
-        raise ConfigurationError(f"--registers: with first_address = {base} there is no register {first}")
+    first, last = _span(registers, keys)
     probed = read_registers(place, (first - base, last - base), seconds, stop)
     rate = possible_rate(probed.speeds)
     fastest = 1.0 / rate if rate else 0.0
@@ -67,20 +68,62 @@ def device_offers(
         for number in probed.requested
         if number.part.layout is not None
     ]
+    if not probed.survey.blocks:
+        remedy = "choose those of the manual by --registers FIRST..LAST, or --table input"
+        raise DeviceError(f"{options.title()}: {'; '.join(probed.survey.describe(base))}: {remedy}")
     if not offers:
-        raise DeviceError(
-            f"{options.title()}: no register changes: let the machine move, or choose others by --registers"
-        )
+        which = "; ".join(probed.survey.describe(base))
+        remedy = "let the machine move, or choose others by --registers"
+        raise DeviceError(f"{options.title()}: no register changes ({which}): {remedy}")
     lines = modbus_driver_lines(place, probed.survey)
     lines += [
         row for row in _rows(keys) if row.partition(" = ")[0] not in {known.partition(" = ")[0] for known in lines}
     ]
+    still = {
+        str(place.shown(block.address + at)): float(words[-1, at].astype(np.int16))
+        for block, words in probed.readings.items()
+        for at in (np.flatnonzero(np.ptp(words, axis=0) == 0) if len(words) else ())
+    }
     title = f"{options.title()}, device {device}: {counted(len(offers), 'number')} that change"
     remark = (
         "registers have neither names nor units: read the display of the drive, and give --display SIGNAL=VALUE; "
         "or --signal SIGNAL=REGISTER, --unit REGISTER=UNIT and --scale, from a manual"
     )
-    return OfferedSource(title, lines, offers, 0.0, remarks=[remark], period=RENEWALS)
+    return OfferedSource(title, lines, offers, 0.0, remarks=[remark], period=RENEWALS, still=still)
+
+
+def with_registers(answers: Answers, registers: tuple[int, int] | None, keys: Mapping[str, Any]) -> Answers:
+    """Return the answers with registers as decimal numbers, as the device offers them.
+
+    Raises:
+        ConfigurationError: what is no register, or none of those that are read.
+    """
+    first, last = _span(registers, keys)
+
+    def register(option: str, text: str) -> str:
+        if re.fullmatch(NUMBER, text) is None:
+            raise ConfigurationError(f"--{option} {text!r} is no register: write its number, like {first}")
+        number = int(text, 16 if "x" in text else 10)
+        if not first <= number <= last:
+            read = f"{first} to {last} are read: choose --registers that contain it"
+            raise ConfigurationError(f"--{option}: register {text}: registers {read}")
+        return str(number)
+
+    return replace(
+        answers,
+        signals={name: register(f"signal {name}", text) for name, text in answers.signals.items()},
+        units={register("unit", text): unit for text, unit in answers.units.items()},
+        scales={register("scale", text): scale for text, scale in answers.scales.items()},
+    )
+
+
+def _span(registers: tuple[int, int] | None, keys: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the first and the last register to read; raise ConfigurationError if there is no such first one."""
+    base = _whole(keys, "first_address", 0)
+    first, last = registers or (base, base + 63)
+    if first < base:
+        raise ConfigurationError(f"--registers: with first_address = {base} there is no register {first}")
+    return first, last
 
 
 def server_offers(

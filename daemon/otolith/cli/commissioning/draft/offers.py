@@ -50,6 +50,7 @@ class OfferedSource:
     check: str = ""  # What 'otolith check' needs behind the machine file
     remarks: Sequence[str] = ()
     period: str = "that of the fastest signal"  # What the sample period is, if an interval shows it
+    still: Mapping[str, float] = field(default_factory=dict)  # What never changed and is no offer, by name
     doubt: str = ""  # What each proposal is in need of, as the source was not there
 
 
