@@ -16,6 +16,7 @@ from otolith.cli.demo import _refuse_busy
 from otolith.cli.main import cli
 from otolith.health.labels import expiry_event
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
+from otolith.publishing import zenoh_config
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
 from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.subscriber import Subscriber
@@ -272,6 +273,19 @@ def test_a_reader_learns_which_option_is_wrong(
     monkeypatch.chdir(site)
     with pytest.raises(ConfigurationError, match=cause):
         reader_settings(credentials, [ENDPOINT])
+
+
+def test_a_reader_names_no_socket_of_another_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What another user left there is no cause that this reader can remove."""
+    (endpoint,) = listening(["local"], "here.foreign")
+    path = Path(endpoint.removeprefix(SOCKET))
+    with socket.socket(socket.AF_UNIX) as hung, Subscriber(Connection(), lambda _: None) as subscriber:
+        hung.bind(str(path))
+        assert endpoint in subscriber.state()
+        monkeypatch.setattr(zenoh_config.os, "geteuid", lambda: path.stat().st_uid + 1)
+        assert endpoint not in subscriber.state()
+        assert "--connect" in subscriber.state()
+    path.unlink()
 
 
 def test_a_reader_names_a_socket_that_does_not_answer() -> None:

@@ -166,6 +166,19 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
     assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
 
 
+def test_a_recording_that_is_still_being_written_is_no_damage(recording: Path) -> None:
+    """Its recorder may have written all so far, but has not closed it."""
+    with RecordingReader(recording, UNITS) as reader:
+        reader._closed = False
+        assert "never closed" in " ".join(reader.warnings())
+    with recording.open("ab"), RecordingReader(recording, UNITS) as reader:
+        assert reader.warnings() == []
+        reader._closed = False
+        (line,) = reader.warnings()
+        assert "still being written" in line
+        assert "never" not in line
+
+
 def test_ctrl_c_does_not_call_a_recording_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A terminal signals the process group; the child that reads the file is in another one."""
     monkeypatch.setattr(recording_module, "READ_IN_CHILD", [sys.executable, "-c", CHILD_IN_OTHER_GROUP])

@@ -8,7 +8,9 @@ import pytest
 
 from otolith.cli.console import Terminal
 from otolith.cli.operation.live_table import LiveTable
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.hypotheses import FaultType
+from otolith.estimation.information import Outcome
 from otolith.health.labels import Numbers
 from otolith.health.limits import Level
 from otolith.health.schema import (
@@ -17,6 +19,7 @@ from otolith.health.schema import (
     EvidenceDocument,
     FindingDocument,
     FindingKind,
+    FitDocument,
     HealthDocument,
     Language,
     PartDocument,
@@ -117,3 +120,51 @@ def test_causes_that_are_equally_likely_have_formulas_for_the_specialist_only(de
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "(2 possible causes)" in text
     assert ("sin(" in text) is details
+
+
+def uncommissioned(language: Language, *, explained: bool) -> ReportDocument:
+    """A report of a machine whose twin still computes with the values of its example."""
+    base = undecided(language)
+    parameters = {name: row.model_copy(update={"is_example": True}) for name, row in base.parameters.items()}
+    fit = FitDocument(
+        rmse_configured={}, rmse_estimated={"i": 0.2}, explained=explained, cost=0.9 if explained else 24.3,
+        variance_ratio=1.0, outcome=Outcome.AGREED, units={"i": "A"},
+    )  # fmt: skip
+    return base.model_copy(update={"parameters": parameters, "fit": fit, "findings": ()})
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_before_commissioning_what_does_not_fit_is_the_file_and_the_advice_is_to_commission(
+    language: Language, tmp_path: Path
+) -> None:
+    say, document = texts_in(language), uncommissioned(language, explained=False)
+    for name, text in shown(document, tmp_path).items():
+        assert "otolith commission" in text, name
+        assert say("undecided_advice") not in text, name
+        assert say("changed") not in text, name
+
+
+def test_where_the_example_explains_the_machine_nothing_is_advised(tmp_path: Path) -> None:
+    for name, text in shown(uncommissioned("en", explained=True), tmp_path).items():
+        assert "otolith commission" not in text, name
+
+
+@pytest.mark.parametrize("explained", [False, True])
+def test_the_words_beside_the_residual_are_those_of_the_window(explained: bool) -> None:
+    table, console = LiveTable(lambda: "", details=True), Terminal(file=io.StringIO(), width=200)
+    table.add(uncommissioned("en", explained=explained).to_json())
+    console.print(table)
+    (line,) = (row for row in console.file.getvalue().splitlines() if "RMSE" in row)  # type: ignore[attr-defined]
+    assert ("not explained" in line) is not explained
+    assert ("0.9 times" if explained else "24 times") in line
+
+
+def test_a_window_that_nothing_explains_is_not_said_to_be_explained() -> None:
+    """Values at their bounds may leave no residual, which no machine has."""
+    document = uncommissioned("en", explained=True).model_copy(update={"decision": WindowDecision.REFUSED})
+    table, console = LiveTable(lambda: ""), Terminal(file=io.StringIO(), width=200)
+    table.add(document.to_json())
+    console.print(table)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "not explained" in text
+    assert "otolith commission" in text

@@ -1,6 +1,7 @@
 """What was learned survives a restart: the same bits, intervals that hold the truth, and no damaged file is used."""
 
 import json
+import logging
 import math
 import shutil
 from collections.abc import Callable
@@ -34,6 +35,7 @@ from otolith.storage.learned_state import LearnedState, learned_state, restored
 from otolith.storage.state_store import MAX_KEPT, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.conftest import EXAMPLES
+from tests.messages import assert_says
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows
 
 KEPT = Path(__file__).parents[1] / "golden" / "state_files"
@@ -366,15 +368,22 @@ def test_whatever_many_files_contain_the_next_report_is_finite(tmp_path: Path, d
     check_changed(tmp_path, data)
 
 
-def test_a_change_of_the_machine_file_keeps_the_components_alone(tmp_path: Path) -> None:
+def test_a_change_of_the_machine_file_keeps_the_components_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It was made deliberately, so that it is no warning; the log says in one line what becomes of the rest."""
+    caplog.set_level(logging.INFO)
     store, document = saved(tmp_path)
     other = replace(PROBLEM, noise=(0.01, 0.02))
     initial = replace(fresh(), posterior=type(fresh().posterior).initial(other))
     state, note = store.restore(initial)
     assert [component.key for component in state.problem.components] == [UNBALANCE]
     assert not any(before.known for before in state.previous.values())
-    assert "parameters or noise in the machine file have changed" in note
+    assert note == ""
     (backup,) = tmp_path.glob("*.kept.json")
+    (line,) = caplog.records
+    assert line.levelno == logging.INFO
+    assert_says(line.getMessage(), "machine file", "begin anew", "components", backup.name)
     assert json.loads(backup.read_text(encoding="utf-8")) == document
 
 

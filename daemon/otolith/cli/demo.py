@@ -30,7 +30,17 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.cli.terminal import echo_json
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import LINE, announcements, brief, event_text, headline, undecided_finding, undecided_text
+from otolith.health.text import (
+    LINE,
+    announcements,
+    awaits_commissioning,
+    brief,
+    event_text,
+    headline,
+    undecided_advice,
+    undecided_finding,
+    undecided_text,
+)
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -180,7 +190,9 @@ class Demo:
         self._history = path_in(self._folder / "history", names.site, names.name)
         self._console = Terminal(stderr=as_json)
         self._reports: list[ReportDocument] = []
-        self._undecided: float | None = None  # Begin of what is open and was printed last, Unix s
+        self._undecided: float | str | None = (
+            None  # What was printed last: begin of what is open in Unix s, or the text
+        )
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def run(self, stopped: Callable[[], bool]) -> int:
@@ -267,10 +279,13 @@ class Demo:
     def _print_plain(self, report: ReportDocument) -> None:
         """Print a report in a line, and in another one what is new while its cause is not yet known: once."""
         self._print(brief(report, self._time_of_day))
-        undecided = undecided_finding(report)
-        if undecided is not None and undecided.since != self._undecided:
-            self._print_wrapped(undecided_text(report, self._time_of_day))
-            self._undecided = undecided.since
+        undecided, finding = undecided_text(report, self._time_of_day), undecided_finding(report)
+        key = undecided if finding is None or awaits_commissioning(report) else finding.since
+        if undecided and key != self._undecided:
+            self._print_wrapped(undecided)
+            if awaits_commissioning(report):
+                self._print_wrapped(undecided_advice(report))
+            self._undecided = key
 
     def _print_wrapped(self, text: str, style: str = "") -> None:
         for line in textwrap.wrap(text, LINE, subsequent_indent="  ", break_on_hyphens=False):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 
+from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.decision import Approval
 from otolith.estimation.information import QUANTILE
 from otolith.health.limits import MACHINE, Level
@@ -468,8 +469,24 @@ def undecided_finding(document: ReportDocument) -> FindingDocument | None:
     return next((item for item in document.findings if item.kind in UNDECIDED and item.id not in told), None)
 
 
+def awaits_commissioning(document: ReportDocument) -> bool:
+    """Whether the twin computes with values of its example, and does not explain the window: nothing has happened."""
+    rows = document.parameters.values()
+    if any(row.baseline is not None for row in rows) or not any(row.is_example for row in rows):
+        return False
+    is_refused = document.decision is WindowDecision.REFUSED or (
+        document.fit is not None and not document.fit.explained
+    )
+    return is_refused or undecided_finding(document) is not None
+
+
 def undecided_text(document: ReportDocument, when: Clock | None = None) -> str:
-    """What is new, since when, and how many causes are possible, while it is open which one holds; else empty."""
+    """What is new, since when, and how many causes are possible, while it is open which one holds; else empty.
+
+    Before the machine was commissioned nothing is new: then that it has to be.
+    """
+    if awaits_commissioning(document):
+        return texts_in(document.health.language if document.health else "en")("awaits_commissioning")
     if (finding := undecided_finding(document)) is None:
         return ""
     texts = texts_in(document.health.language if document.health else "en")
@@ -481,10 +498,11 @@ def undecided_text(document: ReportDocument, when: Clock | None = None) -> str:
 
 
 def undecided_advice(document: ReportDocument) -> str:
-    """What to do while it is open which cause holds; empty if what is known requires action."""
+    """What to do while there is an :func:`undecided_text`; empty if what is known requires action."""
     if document.health is not None and document.health.state is Level.ACT:
         return ""
-    return texts_in(document.health.language if document.health else "en")("undecided_advice")
+    key = "commission_advice" if awaits_commissioning(document) else "undecided_advice"
+    return texts_in(document.health.language if document.health else "en")(key)
 
 
 def zone_of(document: ReportDocument) -> str | None:

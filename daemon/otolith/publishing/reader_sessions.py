@@ -11,7 +11,7 @@ from itertools import islice
 
 import zenoh
 
-from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
+from otolith.publishing.zenoh_config import Connection, is_own, local_sockets, reader_settings
 from otolith.publishing.zenoh_session import ALIVE, MAX_REPLIES, Topic, close_session, session
 from otolith_drivers.errors import ServiceError
 
@@ -93,8 +93,8 @@ class ReaderSessions:
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """Where it looks."""
-        return tuple(self.endpoints or self._opened or local_sockets())
+        """Where it looks: the endpoints, or the sockets of daemons of this user."""
+        return tuple(self.endpoints or filter(is_own, self._opened or local_sockets()))
 
     def where(self, machine: str) -> str:
         """Return the endpoint where a machine was heard, by the prefix of its keys; empty if it was not."""

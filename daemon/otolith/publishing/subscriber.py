@@ -149,14 +149,18 @@ class Subscriber:
 
     def state(self) -> str:
         """Return what it waits for, in words."""
-        addresses = ", ".join(self._sessions.addresses)
+        addresses, is_remote = ", ".join(self._sessions.addresses), bool(self._sessions.endpoints)
         if self.connected and (starting := self.starting):
             return "; ".join(starting)
-        if self.connected:
+        if self.connected and is_remote:
             reports = REPORT.under(self._site, self._machine)
             return f"connected, no report yet; if none comes, this reader may not read {reports} ({addresses})"
-        if addresses:
+        if self.connected:
+            return "connected, no report yet: the first one comes at the end of the first window"
+        if is_remote:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
+        if addresses:
+            return f"no daemon reached yet: it starts, or was killed and left its socket ({addresses})"
         own = "no daemon of this user runs here, and no service whose reports it may read (the group otolith may)"
         return f"{own}; --connect sets where to look"
 

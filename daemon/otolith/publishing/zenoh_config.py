@@ -269,3 +269,11 @@ def local_sockets() -> list[str]:
     """Return the endpoints of the daemons of this computer that this user may read."""
     paths = {path for folder in runtime_folders() if os.access(folder, os.X_OK) for path in folder.glob("*.sock")}
     return [f"{SOCKET}{path}" for path in sorted(paths) if os.access(path, os.W_OK)]
+
+
+def is_own(endpoint: str) -> bool:
+    """Whether the socket of an endpoint belongs to this user; False if it is gone."""
+    try:
+        return Path(endpoint.removeprefix(SOCKET)).stat().st_uid == os.geteuid()
+    except OSError:
+        return False

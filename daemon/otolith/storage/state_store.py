@@ -50,6 +50,7 @@ from otolith_drivers.user_dirs import state_directory, way_out
 log = logging.getLogger(__name__)
 
 KEPT = ".kept.json"
+OTHER_VALUES = "parameters or noise in the machine file have changed since it was saved"
 COMPONENTS = "components"  # the folder of the state directory with these files
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 MAX_KEPT = 8  # files that were not used and are kept under another name
@@ -239,16 +240,22 @@ class StateStore:
         """Return the initial ``state`` with what was saved, and why not all of it was used; empty if it was.
 
         A file that is not used as a whole is kept under another name. If it is damaged, what was saved before it is
-        used. Events of a state that is not used are dropped. Requires the lock.
+        used. Events of a state that is not used are dropped. That the machine file states other values is no fault: it
+        is logged. Requires the lock.
         """
         warm, reason, is_damaged = self._restored(state)
         if not reason:
             return warm, ""
         note = f"{self.components_path}: {'only components are used' if warm.adopted else 'not used'}: {reason}"
         try:
-            note = f"{note}; the file is kept as {self.set_aside().name}"
+            kept = self.set_aside()
         except OtolithError as error:
             return warm, f"{note}; {error}"
+        if reason == OTHER_VALUES:
+            stays = "baselines, events and approved components stay"
+            log.info("the machine file has new values or noise: estimates begin anew, and %s (%s)", stays, kept.name)
+            return warm, ""
+        note = f"{note}; the file is kept as {kept.name}"
         if not is_damaged or not self.earlier_path.exists():
             return warm, note
         try:
@@ -279,7 +286,7 @@ class StateStore:
                 health = replace(health, notes=learned.health.notes, taken=learned.health.taken)
                 return replace(state, health=health), reason, False
             if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
-                reason = "parameters or noise in the machine file have changed since it was saved"
+                reason = OTHER_VALUES
                 learned = learned.model_copy(update={"filter": None, "health": learned.health.without_hints(reason)})
                 if learned.values_fingerprint not in ("", values_fingerprint(state.problem)):
                     learned = without_found(learned, reason)

@@ -11,7 +11,9 @@ differences of the times in ns, then each signal. The bytes of equal weight of a
 because those of a slow signal repeat.
 """
 
+import contextlib
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -37,6 +39,8 @@ APPLICATION = "otolith"  # as otolith.publishing.recorder names it
 READ_IN_CHILD = [sys.executable, "-P", recording_child.__file__]
 MAX_RECORDS = 1_000_000  # as many as a window of a machine file may have
 HEADER = struct.Struct("<I?")
+BEING_WRITTEN = "still being written: its last minutes are not in it yet"
+NEVER_CLOSED = "never closed by the recorder: its last records may be missing"
 
 
 def packed(times: Integers, columns: Sequence[Array], *, good: bool) -> bytes:
@@ -143,6 +147,7 @@ class RecordingReader(Reader):
         self._written: dict[str, str] | None = None  # Unit of each recorded signal; None until the file tells them
         self._closed, self._ended = True, False
         DataFile(path).close()  # raises if it cannot be read
+        self._is_being_written = is_being_written(path)
         self._child = _Parts(path)
         self._parts = iter(self._child)
         try:
@@ -279,10 +284,24 @@ class RecordingReader(Reader):
         return [f"{self._records} records read", f"{self.bad} bad"]
 
     def warnings(self) -> list[str]:
-        lines = [] if self._closed else ["never closed by the recorder: its last records may be missing"]
+        lines = [] if self._closed else [BEING_WRITTEN if self._is_being_written else NEVER_CLOSED]
         if self._windows_bad:
             lines.append(f"windows that were bad when they were recorded, left out: {self._windows_bad}")
         return lines
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a process has ``path`` open for writing, as far as this user may see the processes of this computer."""
+    file = path.stat()
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        with contextlib.suppress(OSError, ValueError, IndexError):  # it has ended, or is of another user
+            opened = link.stat()
+            if (opened.st_dev, opened.st_ino) == (file.st_dev, file.st_ino):
+                information = (link.parents[1] / "fdinfo" / link.name).read_text(encoding="ascii")
+                flags = int(information.partition("flags:")[2].split()[0], 8)
+                if flags & os.O_ACCMODE != os.O_RDONLY:
+                    return True
+    return False
 
 
 class _SignalBuffer:

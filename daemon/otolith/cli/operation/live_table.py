@@ -21,6 +21,7 @@ from otolith.cli.common import drain
 from otolith.cli.console import Localised, Terminal
 from otolith.cli.machines import last_reports
 from otolith.cli.terminal import echo
+from otolith.discovery.alternatives import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.schema import (
     DriverDocument,
@@ -343,9 +344,11 @@ def _messages(document: ReportDocument, texts: Texts, *, details: bool) -> list[
         lines.append(Text(f"{texts('open_test')}: {in_local_time(finding.text, zone)}", style="magenta"))
         lines += [Text(f"  {text}", style="cyan") for text in (finding.advice, finding.setting) if text]
     if document.fit is not None:
-        units, rows = document.fit.units, document.fit.rmse_estimated.items()
+        fit, units = document.fit, document.fit.units
+        rows = (fit.rmse_completed or fit.rmse_estimated).items()  # of the twin as it is: with its components
         errors = ", ".join(f"{name} {quantity_text(value, units.get(name, '1'), digits=3)}" for name, value in rows)
-        explained = texts("explained" if document.fit.explained else "unexplained")
+        is_explained = fit.explained and document.decision is not WindowDecision.REFUSED
+        explained = texts("explained" if is_explained else "unexplained", cost=f"{fit.cost:.2g}")
         lines.append(Text(f"{texts('residual', errors=errors)}: {explained}"))
     return lines
 
