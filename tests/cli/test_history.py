@@ -179,7 +179,7 @@ def test_since_is_an_age_or_a_date(written: HistoryWriter) -> None:
         ((MACHINE, "--since", "yesterday"), "write an age"),
         ((MACHINE, "--csv", "--json"), "give one of"),
         ((MACHINE, "--events", "--parquet", "x.parquet"), "give --csv or --json"),
-        ((MACHINE, "--parquet", "/dev/null"), "exists"),
+        ((MACHINE, "--parquet", "/dev/null"), "another name"),
         ((MACHINE, "--parquet", "/missing/x.parquet"), "no folder"),
     ],
 )

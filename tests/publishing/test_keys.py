@@ -1,5 +1,6 @@
 """``otolith keys``, the checks of the files that a session uses, and how readers find sockets."""
 
+import os
 import re
 import resource
 import socket
@@ -16,7 +17,6 @@ from otolith.cli.demo import _refuse_busy
 from otolith.cli.main import cli
 from otolith.health.labels import expiry_event
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
-from otolith.publishing import zenoh_config
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
 from otolith.publishing.publisher import Published, Publisher
 from otolith.publishing.subscriber import Subscriber
@@ -282,7 +282,7 @@ def test_a_reader_names_no_socket_of_another_user(monkeypatch: pytest.MonkeyPatc
     with socket.socket(socket.AF_UNIX) as hung, Subscriber(Connection(), lambda _: None) as subscriber:
         hung.bind(str(path))
         assert endpoint in subscriber.state()
-        monkeypatch.setattr(zenoh_config.os, "geteuid", lambda: path.stat().st_uid + 1)
+        monkeypatch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
         assert endpoint not in subscriber.state()
         assert "--connect" in subscriber.state()
     path.unlink()

@@ -86,7 +86,7 @@ def restart_command(machine: Path) -> str:
 def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     """Return the file of an option; raise BadParameter if it exists, or its folder does not."""
     if path is not None and path.exists():
-        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
+        raise click.BadParameter(f"{str(path)!r} exists: choose another name, or delete it first")
     if path is not None and not path.parent.is_dir():
         raise click.BadParameter(f"{str(path)!r}: there is no folder {str(path.parent)!r}: make it first")
     return path

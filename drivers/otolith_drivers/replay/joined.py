@@ -15,6 +15,7 @@ from otolith_drivers.replay.readers import (
     Reader,
     Rows,
     head_of,
+    of_files,
     suffix_of,
 )
 
@@ -55,8 +56,7 @@ class JoinedReader(Reader):
         self._rows = self._read = 0  # Rows; files that were read
         self._bad, self._lost = self._begin.bad, self._begin.lost  # In the files before the present one
         self._summaries: list[str] = []  # Of the files that were read
-        self.told: list[str] = []
-        """The warnings of the files that were read to their end."""
+        self._told: list[tuple[Path, str]] = []  # Warnings of the files that were read to their end
         self._first: Reader | None = open_file(paths[0])
         first = self._first
         self.place, self.is_table, self.sampling = f"its file's {first.place}", first.is_table, first.sampling
@@ -136,7 +136,7 @@ class JoinedReader(Reader):
     def _finish(self, reader: Reader) -> None:
         """Keep of a file that was read its counts and warnings alone: there may be thousands."""
         self._summaries.append(_summary(reader))
-        self.told += [f"{reader.path}: {line}" for line in reader.warnings()]
+        self._told += [(reader.path, line) for line in reader.warnings()]
         self._bad, self._lost, self._reader = self._bad + reader.bad, self._lost + reader.lost, None
         self._read, self._taken = self._read + 1, 0
 
@@ -148,7 +148,13 @@ class JoinedReader(Reader):
 
     def warnings(self) -> list[str]:
         reader = self._reader
-        return self.told + ([] if reader is None else [f"{reader.path}: {line}" for line in reader.warnings()])
+        present = [] if reader is None else [(reader.path, line) for line in reader.warnings()]
+        return of_files([*self._told, *present])
+
+    @property
+    def told(self) -> list[str]:
+        """The warnings of the files that were read to their end."""
+        return of_files(self._told)
 
     def describe(self) -> list[str]:
         return [*self._description, f"from {len(self._paths)} files, each a recording of its own"]

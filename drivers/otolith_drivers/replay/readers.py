@@ -6,7 +6,7 @@ import math
 import re
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
@@ -32,6 +32,7 @@ Integers = NDArray[np.int64]
 # Seconds since 1970 reach 1e11 in the year 5138; milliseconds since 1970 passed it in 1973, so a column of them without
 # its unit is refused. Guarded by tests/golden/replays/nanoseconds.
 MAX_TIME = 1e11  # s
+MAX_FILES = 3  # names of files beside a warning; engineering choice, guarded by test_joined.py
 BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is recognised
 
 # Formats by the end of the file name. The module is imported only when a file asks for it.
@@ -431,7 +432,7 @@ class MergedReader(Reader):
         return [f"{title}: {', '.join(reader.summary_lines())}" for title, reader in self._readers]
 
     def warnings(self) -> list[str]:
-        return [f"{reader.path}: {line}" for _, reader in self._readers for line in reader.warnings()]
+        return of_files((reader.path, line) for _, reader in self._readers for line in reader.warnings())
 
     def chunks(self) -> Iterator[Rows]:
         """The rows of all files by time; raise ConfigurationError also if one file ends before another begins."""
@@ -470,3 +471,16 @@ class MergedReader(Reader):
         return [
             line for name, reader in self._readers for line in (f"source {name}: {reader.path}", *reader.describe())
         ]
+
+
+def of_files(told: Iterable[tuple[Path, str]]) -> list[str]:
+    """Return each line that was told of files once, with the files."""
+    files: dict[str, list[Path]] = {}
+    for path, line in told:
+        files.setdefault(line, []).append(path)
+    return [f"{_some(paths)}: {line}" for line, paths in files.items()]
+
+
+def _some(paths: Sequence[Path]) -> str:
+    more = len(paths) - MAX_FILES
+    return ", ".join(map(str, paths[:MAX_FILES])) + (f" and {more} more" if more > 0 else "")

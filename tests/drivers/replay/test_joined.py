@@ -40,7 +40,7 @@ def test_no_window_spans_two_files(tmp_path: Path, later: float) -> None:
         assert joined.progress == 1.0
         assert joined.bad == 2
         assert [line.split(":")[0] for line in joined.summary_lines()] == ["a.csv", "b.csv"]
-        assert all(str(path) in line for path, line in zip(files, joined.warnings(), strict=True))
+        assert_each_says(joined.warnings(), [str(path) for path in files])
     values = [window.column("x") for window in windows]
     assert [len(column) for column in values] == [RECORDS] * 4
     assert np.array_equal(np.concatenate(values[:2]), np.arange(100.0))
@@ -115,5 +115,17 @@ def test_a_file_that_was_read_is_not_kept(tmp_path: Path) -> None:
                 gc.collect()  # a reader and its rows refer to each other
                 assert sum(reader() is not None for reader in made) <= 2
         assert (joined.bad, joined.progress) == (50, 1.0)
-        assert len(joined.warnings()) == 50
+        assert_each_says(joined.warnings(), (str(files[0]), "47 more"))
         assert_each_says(joined.summary_lines(), ("250 rows", "50 of 50"), ("50 bad",))
+
+
+def test_what_holds_of_each_file_is_said_once(tmp_path: Path) -> None:
+    """As that dates without a zone are taken as UTC."""
+    files = [tmp_path / f"{day}.csv" for day in ("monday", "tuesday")]
+    for day, file in enumerate(files, start=1):
+        rows = [f"2026-03-0{day} 10:00:0{second},1.{second}" for second in range(5)]
+        file.write_text("\n".join(["t,x", *rows]) + "\n", encoding="utf-8")
+    with JoinedReader(files, opened) as joined:
+        for _ in joined.chunks():
+            pass
+        assert_each_says(joined.warnings(), ("UTC", "timezone", *map(str, files)))

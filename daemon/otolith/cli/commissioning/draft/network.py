@@ -80,7 +80,7 @@ def device_offers(
         row for row in _rows(keys) if row.partition(" = ")[0] not in {known.partition(" = ")[0] for known in lines}
     ]
     still = {
-        str(place.shown(block.address + at)): float(words[-1, at].astype(np.int16))
+        str(place.shown(block.address + int(at))): float(words[-1, at].astype(np.int16))
         for block, words in probed.readings.items()
         for at in (np.flatnonzero(np.ptp(words, axis=0) == 0) if len(words) else ())
     }
