@@ -1,8 +1,8 @@
 """A DC drive with equations of its own behind a Modbus server of pymodbus: ``python -m tests.system.modbus_drive``.
 
-It runs steadily, or repeats a cycle of voltages, in real time. There is no manual of its registers: 100 has a status that
-never changes, 101 the voltage in 0.01 V, 102 the current in mA, 103 the speed in 0.1 rpm, 104 the seconds since its
-start. The file of its second argument has ``steady`` or ``cycle``, and a factor on the resistance.
+It runs steadily, or repeats a cycle of voltages, in real time. There is no manual of its registers: 100 has a status
+that never changes, 101 the voltage in 0.01 V, 102 the current in mA, 103 the speed in 0.1 rpm, 104 the seconds since
+its start. The file of its second argument has ``steady`` or ``cycle``, and a factor on the resistance.
 """
 
 import asyncio
@@ -29,7 +29,8 @@ class Drive:
     def __init__(self, order: Path) -> None:
         self._order, self._random = order, np.random.default_rng(7)
         self._begun, self._steps = time.monotonic(), 0
-        self.voltage, self.current, self.speed = LEVELS[0], 0.0, 200.0
+        self.voltage, self.speed = LEVELS[0], (LEVELS[0] - R * LOAD / K) / (R * B / K + K)
+        self.current = (B * self.speed + LOAD) / K
 
     def words(self) -> list[int]:
         """Return what the registers hold now."""
