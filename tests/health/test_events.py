@@ -430,6 +430,18 @@ def test_the_values_distinguish_a_sudden_change_from_a_slow_one() -> None:
     assert causes[1].startswith("the insulation between turns fails slowly")
 
 
+@pytest.mark.parametrize("decision", [WindowDecision.STEPPED, WindowDecision.TIMING, WindowDecision.LEARNED])
+def test_a_sudden_change_has_one_advice_whatever_updates_the_values_after_it(decision: WindowDecision) -> None:
+    """Windows contradicted what was known; while it is also open which signal is late, none is said to be a step."""
+    later = WindowDecision.LEARNED if decision is WindowDecision.STEPPED else decision
+    reports = [report(index) for index in range(5)]
+    reports += [report(index, None, decision=WindowDecision.SUSPECTED, status=Status.HELD) for index in (5, 6)]
+    reports += [report(7, 5.8, decision=decision), *(report(index, 5.8, decision=later) for index in range(8, 20))]
+    documents = assessed(reports)
+    assert [change for _, change, _ in changes(documents)] == [EventChange.RAISED]
+    assert "winding-turns-step" in events(documents[-1])["winding"].condition_id
+
+
 def of_length(document: ReportDocument, seconds: float) -> ReportDocument:
     index = document.window.index
     window = document.window.model_copy(update={"start": seconds * index, "end": seconds * (index + 1)})
