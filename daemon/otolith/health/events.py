@@ -333,19 +333,18 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
 def _with_steps(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of a window that updated them, and with their sudden changes.
 
-    A change is also sudden if windows contradicted what was known until this one, which need not say that it is a step:
-    it may say that a signal is late. The history of a parameter begins again at a step. Where what changed most varies
-    in ordinary operation, the windows before, which contradicted what was known, are no doubt.
+    A change is also sudden after windows that contradicted what was known, whatever was decided. The history of a
+    parameter begins again at a step. Where what changed most varies in operation, the windows before are no doubt.
     """
-    is_accepted = report.decision in ACCEPTED
-    rows = {name: row for name, row in report.parameters.items() if is_accepted or row.status is Status.ESTIMATED}
-    known = {name: row.value for name, row in rows.items() if row.value is not None}
+    is_accepted, rows = report.decision in ACCEPTED, report.parameters
+    usable = {name: row.value for name, row in rows.items() if is_accepted or row.status is Status.ESTIMATED}
+    known = {name: value for name, value in usable.items() if value is not None}
     changes = {name: value - state.values[name] for name, value in known.items() if name in state.values}
     values = known if is_accepted else {**state.values, **known}
-    moved = {name for name, change in changes.items() if abs(change) > QUANTILE * (report.parameters[name].sd or 0.0)}
+    moved = {name for name, change in changes.items() if abs(change) > QUANTILE * (rows[name].sd or 0.0)}
     if report.decision is not WindowDecision.STEPPED:
-        is_after_doubt = bool(state.doubtful) and state.agreed < state.doubtful[-1]
-        larger = {name for name in moved if is_after_doubt and abs(changes[name]) > abs(state.steps.get(name, 0.0))}
+        is_doubted = bool(state.doubtful) and state.agreed < state.doubtful[-1]
+        larger = {name for name in moved if is_doubted and abs(changes[name]) > abs(state.steps.get(name, 0.0))}
         return replace(state, values=values, steps={**state.steps, **{name: changes[name] for name in larger}})
     for name in moved:
         state = state.without_history(name)
