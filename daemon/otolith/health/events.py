@@ -218,8 +218,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         if not record.is_over(report.window.index):
             records[key] = record
     dropped, ended = ended_events(state.notes, state.dropped)
-    events += [_ended(plan, event, report.window.start) for event in dropped]
-    events += ended
+    events += [*(_ended(plan, event, report.window.start) for event in dropped), *ended]
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
