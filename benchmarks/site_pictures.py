@@ -11,6 +11,7 @@ from otolith.health.times import moment_text
 from otolith.publishing.zenoh_session import REPORT
 from otolith.site.app import FIRST_PEERS
 from otolith.site.compare import peers, poor_data, week
+from otolith.site.daemons import certificates, versions
 from otolith.site.hall import PAGES, Filter, Hall
 from otolith.site.known import Knowledge
 from otolith.site.words import words_in
@@ -42,7 +43,8 @@ def pages() -> dict[str, str]:
     known, now = knowledge()
     frame = {"title": "Works 2", "words": words_in("en"), "time": moment_text(now, ZONE), "dropped": 0}
     hall = b"".join(Hall(known, ZONE).shown(now, "en").page(Filter(), "", frame)).decode()
-    rows = {"peers": peers(known, now, "en"), "poor": poor_data(known, now, "en", ZONE)}
+    rows = {"peers": peers(known, now, "en"), "poor": poor_data(known, now, "en", ZONE),
+            "versions": versions(known, "en"), "certificates": certificates(known, now, "en", ZONE, None)}  # fmt: skip
     comparison = PAGES.get_template("compare.html").render(
         rows, events=week(known, now, "en", ZONE), first=FIRST_PEERS, here="compare", language="en", refused={}, **frame
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.screens import DOCS, NAME, WIDTHS, Story, plain_demo, story, watched
+from benchmarks.site_pictures import pages
 
 from otolith.cli.console import Terminal
 
@@ -64,3 +65,12 @@ def test_the_demo_says_once_what_is_new_and_ends_with_what_to_do_next(run: Story
     assert text.count("cause not yet known") in {1, 2}
     assert "otolith report " in text.splitlines()[-1]
     assert str(tmp_path) not in text
+
+
+@pytest.mark.full
+def test_the_pages_of_a_site_can_be_made() -> None:
+    made = pages()
+    assert {f"{name}-{width}.png" for name in made for width in (1280, 390)} == {
+        path.name for path in PICTURES.glob("site*")
+    }
+    assert all("press-3" in page for page in made.values())
