@@ -154,7 +154,8 @@ class Subscriber:
             return "; ".join(starting)
         if self.connected and is_remote:
             reports = REPORT.under(self._site, self._machine)
-            return f"connected, no report yet; if none comes, this reader may not read {reports} ({addresses})"
+            cause = f"no window has ended since, or this reader may not read {reports}"
+            return f"connected, no report yet: {cause} ({addresses})"
         if self.connected:
             return "connected, no report yet: the first one comes at the end of the first window"
         if is_remote:
