@@ -390,7 +390,11 @@ def _plan(
 ) -> MonitoringPlan:
     """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
     free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
+    names = [row.name for row in twin.parameters]
     for name, table in file.parameters.items():
+        for other in set(table.as_right_as).difference(names):
+            fault = f"twin {twin.name!r} has no parameter {other!r}: {nearest(other, names)}"
+            context.fail(("parameters", name, "as_right_as"), fault)
         for key, written in (("watch", table.watch), ("act", table.act), ("temperature", table.temperature)):
             if written and name not in free:
                 what = "temperature" if key == "temperature" else "limit"
@@ -416,6 +420,10 @@ def _plan(
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
     known = _with_waiting_limits(known, own)
+    for name, table in file.parameters.items():
+        held = tuple(other for other in table.as_right_as if other in known)
+        rows = parameters if name in free else known
+        rows[name] = replace(rows[name], as_right_as=held)
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)

@@ -134,6 +134,8 @@ class ParameterTable(LimitsTable):
     """K, for which value and limits are stated."""
     temperature_range: Annotated[float, BeforeValidator(Quantity("K", 0.0, 500.0, difference=True))] = COLDEST
     """By how much it may be colder than at the reference temperature, K, if that is not measured."""
+    as_right_as: tuple[str, ...] = ()
+    """Known parameters that the data of commissioning did not tell from this one: they must be right as well."""
     thermal_time_constant: Annotated[float, BeforeValidator(Quantity("s", 1.0, 1e6))] = THERMAL_TIME
 
 

@@ -211,7 +211,7 @@ def test_a_baseline_of_new_values_is_none_for_a_daemon_that_has_the_old_ones(
         ran.write_text(text.replace("[parameters]", '[parameters]\nL_a = "0.7 H"'), encoding="utf-8")
     else:
         values = OwnValues((OwnValue("L_a", 0.7, 0.01),), {}, 1.0, 4, {"omega": 1.0}, 1.0)
-        monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+        monkeypatch.setattr(own_values, "own_values", lambda *_, **__: values)
     result = otolith("commission", ran, *SPAN, "--windows", "4", *([] if by_hand else ["--write"]))
     assert dict(load_machine(ran, with_driver=False).problem.known)["L_a"] == pytest.approx(0.7)
     last = result.stderr.splitlines()[-1]
@@ -239,7 +239,7 @@ def with_limits(file: Path) -> str:
 def found(monkeypatch: pytest.MonkeyPatch, value: float, share: float = 1.0, faults: tuple[str, ...] = ()) -> None:
     """Let the data show ``value`` for R_a, and a ``share`` of the variance of the speed."""
     values = OwnValues((OwnValue("R_a", value, 0.01),), {}, 1.0, 4, {"omega": share}, 1.0, faults=faults)
-    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    monkeypatch.setattr(own_values, "own_values", lambda *_, **__: values)
 
 
 def test_values_that_are_written_leave_the_limits_of_a_person(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +286,7 @@ def test_a_record_of_two_states_of_the_machine_gives_no_values(
     text = with_limits(ran)
     step = ValueChange("R_a", 6.5, 0.01, 7.4, 0.02, since=BEGIN + 34.0, until=BEGIN + 32.0)
     values = OwnValues((OwnValue("R_a", 6.9, 0.01),), {}, 1.0, 12, {"omega": 1.0}, 1.0, faults=faults, changes=(step,))
-    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    monkeypatch.setattr(own_values, "own_values", lambda *_, **__: values)
     with raises_saying(ConfigurationError, "R_a", "6.5", "7.4", "08:00:32", "08:00:34", *faults):
         otolith("commission", ran, *SPAN, "--windows", "4", "--write")
     assert ran.read_text(encoding="utf-8") == text
@@ -296,7 +296,7 @@ def test_a_drift_is_written_and_told_at_both_ends(ran: Path, monkeypatch: pytest
     with_limits(ran)
     drift = ValueChange("R_a", 6.4, 0.01, 6.8, 0.02, None, None)
     values = OwnValues((OwnValue("R_a", 6.6, 0.01),), {}, 1.0, 12, {"omega": 1.0}, 1.0, changes=(drift,))
-    monkeypatch.setattr(own_values, "own_values", lambda *_: values)
+    monkeypatch.setattr(own_values, "own_values", lambda *_, **__: values)
     result = otolith("commission", ran, *SPAN, "--windows", "4", "--write")
     assert tables(ran)["parameters"]["R_a"]["value"] == "6.6 ohm"
     assert_says(result.stderr, "R_a", "6.4", "6.8")

@@ -54,12 +54,18 @@ def widened(parameter: Parameter) -> Parameter:
     return replace(parameter, low=low / WIDER if low > 0.0 else WIDER * low, high=high * WIDER if high > 0.0 else high)
 
 
-def own_values(
-    problem: Problem, windows: Sequence[Window], free: Sequence[Parameter], loads: Collection[str], progress: Progress
+def own_values(  # noqa: PLR0913 - what is known beside the windows
+    problem: Problem,
+    windows: Sequence[Window],
+    free: Sequence[Parameter],
+    loads: Collection[str],
+    progress: Progress,
+    *,
+    stated: Collection[str] = (),
 ) -> OwnValues:
     """Return the values of the ``free`` parameters; ``loads`` are those of them that windows do not share.
 
-    Other parameters are as in ``problem``.
+    Other parameters are as in ``problem``; those that are ``stated`` are of this machine, not of the twin's example.
     """
     usable = sorted(usable_windows(problem, windows), key=lambda window: -_movement(problem.base_model, window))
     chosen = sorted(usable[:FITTED_WINDOWS], key=lambda window: window.start)
@@ -67,7 +73,7 @@ def own_values(
         return OwnValues((), {}, np.inf, len(chosen), faults=faults)
     if not chosen:
         return OwnValues((), {}, np.inf, 0)
-    record = _RecordSearch(problem, tuple(free), frozenset(loads), progress)
+    record = _RecordSearch(problem, tuple(free), frozenset(loads), progress, frozenset(stated))
     best, punctual = record.punctual(chosen)
     changes = record.changes(best, sorted(usable, key=lambda window: window.start)) if best.is_followed else ()
     if best.is_followed and not best.is_explained:
@@ -114,6 +120,7 @@ class _RecordSearch:
     free: tuple[Parameter, ...]
     loads: frozenset[str]
     progress: Progress
+    stated: frozenset[str]
 
     def search(
         self, windows: Sequence[Window], problem: Problem | None = None, start: Mapping[str, float] | None = None
@@ -130,7 +137,7 @@ class _RecordSearch:
         wide = tuple(row if row.name.startswith("_") else widened(row) for row in rows)
         phases = {row.name for row in rows if row.name.startswith("_phase_")}
         searched = replace(base, known=tuple(known), free=wide, open_loop=False)
-        return ValueSearch(searched, windows, self.loads | phases, self.progress, start)
+        return ValueSearch(searched, windows, self.loads | phases, self.progress, start, stated=self.stated)
 
     def punctual(self, windows: Sequence[Window]) -> tuple[OwnValues, list[Window]]:
         """Return the values, and the windows without the delays that show beside them."""

@@ -133,7 +133,7 @@ def deviations(
     jacobian = result.jacobian[:, :count] / slopes * lengths / max(cost, 1.0)
     own = result.jacobian[:, count:]
     scale = np.maximum(np.linalg.norm(own, axis=0), np.finfo(float).tiny)
-    left = _projected(own / scale, jacobian)
+    left = projected(own / scale, jacobian)
     normal = left.T @ left
     eigenvalues, directions = np.linalg.eigh(normal)
     variances = 1.0 / np.maximum(eigenvalues, 1e-12 * max(float(eigenvalues.max()), 1e-300))
@@ -147,7 +147,7 @@ def deviations(
     return sd, [names[at] for at in order if weights[at] > 0.1 * weights.max()]
 
 
-def _projected(own: Array, columns: Array) -> Array:
+def projected(own: Array, columns: Array) -> Array:
     """Return what no combination of the columns ``own`` explains of ``columns``."""
     basis, sizes, _ = np.linalg.svd(own, full_matrices=False)
     basis = basis[:, sizes > 1e-9 * sizes.max(initial=0.0)]

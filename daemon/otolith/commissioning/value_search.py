@@ -1,12 +1,13 @@
 """The search for values of parameters that several windows show together."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.constancy import ValueChange
+from otolith.commissioning.dependence import Dependence, dependences, responses
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
@@ -17,7 +18,7 @@ from otolith.estimation.minimisers import MAX_STEPS, FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay
-from otolith.twin.definition import Parameter
+from otolith.twin.definition import Parameter, Role
 from otolith_drivers.units import is_one_in_si
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
@@ -38,6 +39,7 @@ class OwnValue:
     sd: float | None = None  # None if it is not determined
     remark: str = ""  # Why it is not determined, or what it is taken from
     is_taken: bool = False  # Whether it is taken from another parameter
+    only_with: tuple[Dependence, ...] = ()  # Held parameters: where one of them is wrong, so is this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +94,21 @@ class _Fitted:
 class ValueSearch:
     """A search for the values that all windows have in common."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what is known beside the windows
         self,
         problem: Problem,
         windows: Sequence[Window],
         loads: frozenset[str],
         progress: Progress,
         start: Mapping[str, float] | None = None,
+        *,
+        stated: Collection[str] = (),
     ) -> None:
-        """The search begins at the values ``start``, else at those of ``problem``, at which parameters are held."""
-        self._start = start or {}
+        """The search begins at the values ``start``, else at those of ``problem``, at which parameters are held.
+
+        Those that are ``stated`` are of this machine, other known ones of the twin's example.
+        """
+        self._start, self._stated = start or {}, frozenset(stated)
         self._problem, self._windows, self._loads, self._progress = problem, windows, loads, progress
         self._places = {parameter.name: at for at, parameter in enumerate(problem.free)}
         self._fixed: dict[str, str] = {}  # Not determined, and why
@@ -115,7 +122,7 @@ class ValueSearch:
         while True:
             shared = self._shared()
             if not shared:
-                return OwnValues(self._values({}, {}), {}, np.inf, len(self._windows))
+                return OwnValues(self._values({}, {}, None), {}, np.inf, len(self._windows))
             self._last = fitted = self._fitted(shared)
             if fitted.weakest is None:
                 break
@@ -126,7 +133,8 @@ class ValueSearch:
             for name in self._loads & self._places.keys()
             if (own := [float(guess[self._places[name]]) for guess in fitted.guesses])
         }
-        others, quiet_cost = self._quieter(fitted.stage)
+        quiet, quiet_cost = self._quieter(fitted.stage)
+        others = {name: float(quiet.guesses[0][ats[0]]) for name, ats in quiet.shared.items()}
         spread = {name: float(np.hypot(sd[name], others[name] - value)) for name, value in values.items()}
         shares, misfits = self._simulated(fitted.stage)
         found = OwnValues((), loads, fitted.cost, len(self._windows), shares, quiet_cost, misfits)
@@ -134,19 +142,19 @@ class ValueSearch:
         spread = {name: max(own, self._beside.get(name, 0.0)) for name, own in spread.items()}
         differ = [name for name in values if abs(others[name] - values[name]) > SIGNIFICANT_DEVIATE * sd[name]]
         if found.is_explained and not differ:  # the fit that trusts the twin more is right, and more precise
-            return replace(found, values=self._values(others, spread))
+            return replace(found, values=self._values(others, spread, quiet))
         faults = tuple(self._contradictions([name for name in wide if name[0] != "_"], values, others))
-        return replace(found, values=self._values(values, spread), faults=faults)
+        return replace(found, values=self._values(values, spread, fitted.stage), faults=faults)
 
-    def _quieter(self, stage: _Stage) -> tuple[dict[str, float], float]:
-        """Return the values of a fit that trusts the twin more, and its cost.
+    def _quieter(self, stage: _Stage) -> tuple[_Stage, float]:
+        """Return what a fit reaches that trusts the twin more, and its cost.
 
         Both fits have the same values but for noise if the twin lacks nothing (J. A. Hausman, Econometrica 46, 1978).
         """
         noise = tuple(QUIETER * level for level in stage.problem.process_noise)
         quieter = replace(stage, problem=replace(stage.problem, process_noise=noise))
         guesses, result, together = self._fit(quieter, MAX_STEPS)
-        return {name: float(guesses[0][ats[0]]) for name, ats in stage.shared.items()}, together.cost(result)
+        return replace(quieter, guesses=guesses), together.cost(result)
 
     def _simulated(self, stage: _Stage) -> tuple[dict[str, float], tuple[float, ...]]:
         """Return the explained share of the variance of each output that moves, and the mean square left by window.
@@ -332,19 +340,47 @@ class ValueSearch:
     def _nominal(self, name: str) -> float:
         return self._problem.free[self._places[name]].nominal
 
-    def _values(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[OwnValue, ...]:
-        rows = []
-        for name in self._places:
-            if name in self._loads:
-                continue
-            if name in self._equal:
-                other = self._equal[name]
-                rows.append(OwnValue(name, values[other], sd[other], f"taken as equal to {other}", is_taken=True))
-            elif name in self._fixed:
-                rows.append(OwnValue(name, self._nominal(name), None, self._fixed[name]))
-            else:
-                rows.append(OwnValue(name, values[name], sd[name]))
-        return tuple(rows)
+    def _responses(self, stage: _Stage) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+        """Return the values of the held parameters; and by how much a unit of each moves those that were fitted."""
+        twin, count = stage.problem.base_model, len(stage.parameters)
+        own = {row.name: row for row in twin.parameters if row.role is not Role.SETTING}
+        held = {name: value for name, value in stage.problem.known if name in own}
+        rows = [replace(own[name], nominal=value) for name, value in held.items()]
+        known = tuple(pair for pair in stage.problem.known if pair[0] not in held)
+        problem = replace(stage.problem, known=known, free=(*stage.problem.free, *rows))
+        guesses = [np.concatenate([guess[:count], [*held.values()], guess[count:]]) for guess in stage.guesses]
+        wider = count + len(held)
+        shared = {**stage.shared, **{name: [count + at] for at, name in enumerate(held)}}
+        together = SharedFit(
+            [
+                Objective(problem, window, guess[:wider], guess[wider:])
+                for window, guess in zip(self._windows, guesses, strict=True)
+            ],
+            shared,
+            problem,
+        )
+        names = list(stage.shared)
+        moved = responses(together, together.joined(guesses), list(held), names)
+        by_value = {
+            name: {item: float(numbers[at]) for item, numbers in moved.items()} for at, name in enumerate(names)
+        }
+        return held, by_value
+
+    def _values(
+        self, values: Mapping[str, float], sd: Mapping[str, float], stage: _Stage | None
+    ) -> tuple[OwnValue, ...]:
+        """Return the rows of all parameters; ``stage`` has what the ``values`` were reached with."""
+        held, moved = self._responses(stage) if stage else ({}, {})
+        rows = dict[str, OwnValue]()
+        for name, value in values.items():
+            size, half = self._size(name, value), QUANTILE * sd[name]
+            depends, wider = dependences(size, half, moved[name], held, self._stated)
+            rows[name] = OwnValue(name, value, sd[name] + wider / QUANTILE, only_with=depends)
+        for name, other in self._equal.items():
+            rows[name] = replace(rows[other], name=name, remark=f"taken as equal to {other}", is_taken=True)
+        for name, remark in self._fixed.items():
+            rows[name] = OwnValue(name, self._nominal(name), None, remark)
+        return tuple(rows[name] for name in self._places if name not in self._loads)
 
 
 def are_one_constant(one: Parameter, other: Parameter) -> bool:

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from otolith.health.limits import Level, MonitoredQuantity
-from otolith.health.schema import FindingKind, Language
+from otolith.health.schema import FindingKind, HeldDocument, Language
 from otolith.health.text import Texts, texts_in
 from otolith_drivers.config_files import Range, StrictModel
 
@@ -126,6 +126,11 @@ class MonitoringPlan:
     def texts(self) -> Texts:
         """The texts in the language of the machine."""
         return texts_in(self.language)
+
+    def held_with(self, name: str) -> dict[str, HeldDocument]:
+        """Return the held values with which the value of a parameter is right or wrong."""
+        held = {other: self.known[other] for other in {**self.known, **self.parameters}[name].as_right_as}
+        return {other: HeldDocument(value=row.nominal, unit=row.unit) for other, row in held.items()}
 
     @property
     def parts(self) -> tuple[str, ...]:

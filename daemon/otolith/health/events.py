@@ -44,7 +44,7 @@ from otolith.health.schema import (
     WindowDocument,
 )
 from otolith.health.status import required_limits, with_lacks
-from otolith.health.text import PARTS, duration_text, reasons_of
+from otolith.health.text import PARTS, duration_text, only_as_right_as, reasons_of
 
 KNOWN_WINDOWS = 10  # that agree with the machine file, after which what contradicts it is a change of the machine
 RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
@@ -360,14 +360,17 @@ def _before_the_last_run(doubtful: tuple[int, ...], now: int) -> tuple[int, ...]
     return tuple(rest)
 
 
-def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float | bool]:
+def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, object]:
     """Return the baseline of a parameter, its limit, and its value at the reference temperature if one is measured.
 
-    Also whether its nominal value is of another machine.
+    Also whether its nominal value is of another machine, and with which held values it is right or wrong.
     """
     quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
-    judged: dict[str, float | bool] = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    judged: dict[str, object] = {"baseline": quantity.nominal} if quantity.has_baseline else {}
     judged |= {"is_example": True} if quantity.is_example else {}
+    if quantity.as_right_as and item.value is not None:
+        judged["as_right_as"] = held = plan.held_with(name)
+        judged["reason"] = PARTS.join(filter(None, (item.reason, plan.texts.translated(only_as_right_as(held)))))
     if quantity.limits:
         worst = min(quantity.limits, key=lambda row: (-row.level.rank, abs(row.value - quantity.nominal)))
         judged["limit"] = worst.value

@@ -75,6 +75,7 @@ class MonitoredQuantity:
     reference: float = 293.15  # Temperature for which nominal value and limits are stated, K
     coldest: float = COLDEST  # By how much it may be colder than at the nominal value, K
     thermal_time: float = THERMAL_TIME  # Time constant with which its temperature changes, s
+    as_right_as: tuple[str, ...] = ()  # Parameters that are held, and that the data do not tell from this one
     is_example: bool = False  # Whether nominal is of the twin's example, which is another machine
     has_baseline: bool = False  # Whether nominal is a value from commissioning instead of that of the machine file
 

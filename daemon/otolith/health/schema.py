@@ -296,6 +296,13 @@ class ForecastDocument(DocumentModel):
     reason: str = ""  # Why there is no forecast
 
 
+class HeldDocument(DocumentModel):
+    """A value that is not estimated."""
+
+    value: float
+    unit: str
+
+
 class ParameterDocument(DocumentModel):
     """One parameter: value, unit, uncertainty, status, reason."""
 
@@ -317,6 +324,8 @@ class ParameterDocument(DocumentModel):
     progress: float = 0.0  # How far the interval has come from the bounds to what is required, 0 to 1
     identifiability: Identifiability | None = None
     reason: str = ""
+    as_right_as: dict[str, HeldDocument] | None = None
+    """Parameters that are held, and that the data do not tell from this one: where they are wrong, so is it."""
     forecast: ForecastDocument | None = None  # None without limits
     advice: str | None = None  # The experiment that would determine the parameter, if this window did not
 

@@ -26,6 +26,7 @@ from otolith.health.schema import (
     FindingDocument,
     FindingKind,
     HealthDocument,
+    HeldDocument,
     Language,
     NoteDocument,
     ParameterDocument,
@@ -240,6 +241,12 @@ def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
     half = QUANTILE * parameter.sd
     scale = scale_of(parameter.value, parameter.unit, half)
     return *scale.numbers(parameter.value, half), scale.unit, change
+
+
+def only_as_right_as(held: Mapping[str, HeldDocument]) -> str:
+    """With which held values an estimate is right or wrong; empty without any."""
+    texts = [f"{name} = {quantity_text(item.value, item.unit)}" for name, item in held.items()]
+    return f"only as right as what is held: {', '.join(texts)}" if texts else ""
 
 
 def parameter_text(name: str, parameter: ParameterDocument) -> str:

@@ -13,6 +13,7 @@ from otolith.cli.terminal import echo, echo_json
 from otolith.fmu.description import read_fmu
 from otolith.fmu.reference import FmuReference
 from otolith.fmu_twin import TUNABLE
+from otolith.health.text import only_as_right_as
 from otolith.machine import LoadedMachine, load_machine
 from otolith.outlet_tables import MachineOutlets
 from otolith.publishing.zenoh_config import Access, listening
@@ -99,12 +100,15 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         *_delays(machine),
         f"windows of {file.window.length:g} s, {machine.records} records",
     ]
-    for name, value in problem.known:
-        known = twin.parameter(name)
-        lines.append(f"known: {name} = {value:g} {known.unit} ({known.meaning}){_origin(name, file.parameters)}")
+    known = dict(problem.known)
+    for name, value in known.items():
+        row = twin.parameter(name)
+        lines.append(f"known: {name} = {value:g} {row.unit} ({row.meaning}){_origin(name, file.parameters)}")
+        lines += _held(machine, name)
     for free in problem.free:
         bounds = f"from {free.low:g} to {free.high:g} {free.unit}, starting at {free.nominal:g} {free.unit}"
         lines.append(f"estimated: {free.name} {bounds} ({free.meaning}){_origin(free.name, file.parameters)}")
+        lines += _held(machine, free.name)
         limits = machine.plan.parameters[free.name].limits_text
         lines.append(f"limits of {free.name}: {limits or NO_LIMITS.format(free.name, _example_limits(free))}")
     for name, site in machine.plan.sites.items():
@@ -130,6 +134,12 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
+
+
+def _held(machine: LoadedMachine, name: str) -> list[str]:
+    """Return the line that says with which held values a parameter is right or wrong; none without any."""
+    held = only_as_right_as(machine.plan.held_with(name))
+    return [f"{name} is {held}"] if held else []
 
 
 def equations(twin: Definition) -> list[str]:

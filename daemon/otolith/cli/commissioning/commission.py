@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from otolith.commissioning.constancy import ValueChange
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise
-    from otolith.commissioning.value_search import OwnValues
+    from otolith.commissioning.value_search import OwnValue, OwnValues
     from otolith.health.prognosis import History
     from otolith.machine import LoadedMachine
     from otolith.storage.history import HistoryReader
@@ -139,7 +139,7 @@ def _with_own_values(machine: "LoadedMachine", data: "HealthyData", windows: int
         return machine
     with progress_line("reading") as show:
         chosen = good_windows(machine, data, windows)
-        found = own_values(machine.problem, chosen, free, loads, show)
+        found = own_values(machine.problem, chosen, free, loads, show, stated=_stated(machine))
     reasons = [_refusal(machine, found)] if found.faults or not found.is_followed else []
     if steps := [change for change in found.changes if not change.is_drift]:
         reasons.append(_of_two_states(machine, steps))
@@ -210,12 +210,16 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
             remarks.append(f"{row.name} ({row.meaning}): {item.remark}; {stays}")
             continue
         origin = item.remark or f"from {data.name}"
-        remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, {origin}"
+        remark = f"± {QUANTILE * item.sd:.2g} {row.unit}, {origin}{_as_right_as(machine, item)}"
         source = item.remark if item.is_taken else row.meaning
         drift = next((change for change in found.changes if change.name == item.name and change.is_drift), None)
         moves = f"; it moves from {drift.before:.4g} to {drift.after:.4g} {row.unit} in the record" if drift else ""
-        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({source}){moves}")
+        depends = _as_right_as(machine, item)
+        remarks.append(f"{row.name} = {interval_text(item.value, item.sd, row.unit)} ({source}){depends}{moves}")
         value = written_value(machine, row, item.value, _bounds(row, item.value))
+        if item.only_with:
+            value = value if isinstance(value, dict) else {"value": value}
+            value["as_right_as"] = [other.name for other in item.only_with]
         lines[row.name] = NewLine(value, f"{row.meaning}: {remark}")
     for name, (low, high) in found.loads.items():
         row, largest = machine.twin.parameter(name), max(abs(low), abs(high))
@@ -224,6 +228,22 @@ def _value_lines(machine: "LoadedMachine", found: "OwnValues", data: Path) -> "t
             remark = f"{row.meaning}: {low:.3g} to {high:.3g} {row.unit} in {data.name}"
             lines[name] = NewLine(written_value(machine, row, 0.5 * (low + high), ends), remark)
     return lines, remarks
+
+
+def _as_right_as(machine: "LoadedMachine", item: "OwnValue") -> str:
+    """Return with which held values a value is right or wrong, and by how much."""
+    from otolith.health.schema import HeldDocument
+    from otolith.health.text import only_as_right_as
+
+    if not item.only_with:
+        return ""
+    units = machine.twin.units()
+    held = {other.name: HeldDocument(value=other.value, unit=units[other.name]) for other in item.only_with}
+    changes = [
+        f"1 % more {other.name} is {abs(other.share):.2g} % {'more' if other.share > 0.0 else 'less'} {item.name}"
+        for other in item.only_with
+    ]
+    return f"; {only_as_right_as(held)} ({', '.join(changes)})"
 
 
 def written_value(
