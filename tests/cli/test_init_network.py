@@ -24,6 +24,8 @@ from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
 from otolith_drivers.mqtt_probe import ObservedMessages
 from otolith_drivers.opcua import connection
+from otolith_drivers.opcua.watching import Changes
+from otolith_drivers.units import Quantity
 from tests.cli.commands import otolith, tables
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Words, library_server
@@ -232,10 +234,25 @@ def test_variables_of_a_server_find_the_twin(tmp_path: Path, monkeypatch: pytest
     assert len(browsed) == 1  # which costs a server several requests for each variable
     read = tables(file)
     assert read["driver"]["stamps"] == "server"
+    period = Quantity("s")(read["window"]["sample_period"])
+    assert period != pytest.approx(0.05)  # which is only that of the messages
     assert {name: table.get("node") for name, table in read["signals"].items()} == {
         "V_a": "nsu=urn:motor;s=ArmatureVoltage", "i": "nsu=urn:motor;s=ArmatureCurrent",
         "omega": "nsu=urn:motor;s=RotorSpeed", "T_load": None,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("steps", "interval"),
+    [([0.02] * 20, 0.02), ([0.02, 0.02, 0.02, 0.0, 0.3, 0.02, 0.02, 0.02, 0.02, 0.02], 0.02), ([0.02] * 7, None)],
+    ids=["regular", "a pause, and one time twice", "too few"],
+)
+def test_the_sample_period_of_a_server_is_that_with_which_its_variables_change(
+    steps: list[float], interval: float | None
+) -> None:
+    """The interval of the subscription is that of its messages, which says nothing of the variables."""
+    changes = Changes(np.cumsum([1.8e9, *steps]).tolist(), [0.0] * (len(steps) + 1))
+    assert changes.interval == (None if interval is None else pytest.approx(interval, rel=1e-3))
 
 
 def test_messages_of_a_broker_find_the_twin(tmp_path: Path) -> None:

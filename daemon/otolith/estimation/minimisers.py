@@ -72,7 +72,8 @@ def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> Fi
             continue
         residuals, jacobian = objective.linearise(trial)
         evaluations += 1
-        chi_square = float(residuals @ residuals)
+        with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges, which is no better
+            chi_square = float(residuals @ residuals)
         if chi_square < reached.chi_square:
             converged = _is_negligible(reached.chi_square, chi_square)
             reached = FitResult(trial, residuals, jacobian, chi_square, evaluations, converged, reached.first)

@@ -509,8 +509,8 @@ def _ordinal(number: int) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration with three digits, in ms below one second."""
-    return f"{seconds * 1e3:.3g} ms" if seconds < 1.0 else f"{seconds:.4g} s"
+    """Return a duration with three digits, in ms below one second; 999.6 of them would be 1e+03."""
+    return f"{seconds * 1e3:.3g} ms" if seconds < 0.9995 else f"{seconds:.4g} s"
 
 
 def computing_time_text(seconds: float, longest: float, length: float) -> str:

@@ -339,17 +339,6 @@ async def browse(client: Client, most: int) -> list[Variable]:
     return variables[:most]
 
 
-async def present_values(client: Client, variables: Sequence[Variable]) -> list[Any]:
-    """Return the value that each of ``variables`` has now; None if it has none."""
-    spaces = await namespaces(client)
-    values = []
-    for variable in variables:
-        node = client.get_node(place(variable.node, spaces, "").node)
-        read = await node.read_data_value(raise_on_bad_status=False)
-        values.append(None if read.Value is None else read.Value.Value)
-    return values
-
-
 async def _variable(client: Client, node: ua.NodeId, path: str, spaces: Sequence[str]) -> Variable:
     read = await client.get_node(node).read_data_value(raise_on_bad_status=False)
     variant, status = read.Value, read.StatusCode or ua.StatusCode()

@@ -23,11 +23,13 @@ from otolith_drivers.units import is_unit
 
 if TYPE_CHECKING:
     from otolith_drivers.modbus.probe import Number
+    from otolith_drivers.mqtt_probe import ObservedNumber
     from otolith_drivers.opcua.connection import OpcuaOptions, Variable
+    from otolith_drivers.opcua.watching import Changes
 
 MAX_VARIABLES = 500  # of a server that are read
 RENEWALS = "that with which its registers change while the machine moves, as far as the device answers so often"
-READINGS = 4  # of an OPC UA server in the time of listening
+CHANGES = "that with which the variables change while the machine moves"
 ADDRESSING = ("device", "first_address")  # keys of [driver] beside those of the line
 
 
@@ -135,41 +137,33 @@ def server_offers(
 
     options = validated({"endpoint": endpoint} | dict(keys), OpcuaOptions, ())
     with progress_line(f"reading {endpoint}") as show:
-        variables, readings = asyncio.run(_watched(options, folder, seconds, stop, show))
-    values: dict[str, list[float]] = {}
-    for reading in readings:
-        for variable, value in zip(variables, reading, strict=True):
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                values.setdefault(variable.node, []).append(float(value))
-    numbers = [variable for variable in variables if variable.node in values]
+        numbers = asyncio.run(_watched(options, folder, seconds, stop, show))
     if not numbers:
         raise DeviceError(f"OPC UA {endpoint}: no variable with a number; 'otolith probe opcua' shows what there is")
-    names = Counter(variable.path.rpartition("/")[2] for variable in numbers)
+    names = Counter(variable.path.rpartition("/")[2] for variable, _ in numbers)
     offers = []
-    for variable in numbers:
+    for variable, changes in numbers:
         short = variable.path.rpartition("/")[2]
-        series = np.array(values[variable.node])
+        series = np.array(changes.values or [float(variable.value)])
         unit = variable.unit if variable.unit and is_unit(variable.unit) else unit_in(short)
         name = short if names[short] == 1 else variable.path
-        offers.append(Offer(name, unit, {"node": variable.node}, series[np.isfinite(series)], options.interval))
+        offers.append(Offer(name, unit, {"node": variable.node}, series[np.isfinite(series)], changes.interval))
     lines = ["[driver]", 'type = "opcua"', f"endpoint = {toml_value(endpoint)}", *_rows(keys)]
-    return OfferedSource(f"OPC UA {endpoint}: {counted(len(offers), 'number')}", lines, offers, 0.0)
+    return OfferedSource(f"OPC UA {endpoint}: {counted(len(offers), 'number')}", lines, offers, 0.0, period=CHANGES)
 
 
 async def _watched(
     options: "OpcuaOptions", folder: Path, seconds: float, stop: StopSignal, show: Callable[[str], None]
-) -> "tuple[list[Variable], list[list[Any]]]":
-    """Return the variables of a server, and their values in each of several readings."""
-    from otolith_drivers.opcua.connection import browse, present_values
+) -> "list[tuple[Variable, Changes]]":
+    """Return the variables of a server that are numbers, and how they change."""
+    from otolith_drivers.opcua.connection import browse
+    from otolith_drivers.opcua.watching import is_number, watch
 
     async with opened_server(options, folder) as client:
-        variables = await browse(client, MAX_VARIABLES)
-        readings = [[variable.value for variable in variables]]
-        while len(readings) < READINGS and not stop.received():
-            show(f"reading {options.endpoint}: {len(readings)} of {READINGS}")
-            await asyncio.to_thread(stop.wait, seconds / READINGS)
-            readings.append(await present_values(client, variables))
-        return variables, readings
+        numbers = [variable for variable in await browse(client, MAX_VARIABLES) if is_number(variable.value)]
+        show(f"reading {options.endpoint}: {counted(len(numbers), 'number')} for {seconds:g} s")
+        changes = await watch(client, numbers, seconds, stop.received) if numbers else []
+        return list(zip(numbers, changes, strict=True))
 
 
 def broker_offers(
@@ -184,19 +178,27 @@ def broker_offers(
     options: Any = validated(place | dict(keys), module.Options, ())
     with progress_line(f"listening to {target}"):
         messages = observe(options, folder, seconds, stop.received, topics)
-    offers = []
-    for number in messages.numbers.values():
-        name = number.topic if number.path is None else f"{number.topic} {number.path}"
+    offers, whole = list[Offer](), [_name(number) for number in messages.numbers.values()]
+    names = Counter(short for _, short in whole)
+    for number, (path, short) in zip(messages.numbers.values(), whole, strict=True):
+        name = short if names[short] == 1 else path
         source = {"topic": number.topic} | ({} if number.path is None else {"field": number.path})
         steps = np.diff(number.times)
         interval = float(np.median(steps)) if len(steps) and np.median(steps) > 0.0 else None
         series = np.array(number.values)
-        offers.append(Offer(name, unit_in(name), source, series[np.isfinite(series)], interval))
+        offers.append(Offer(name, unit_in(path), source, series[np.isfinite(series)], interval))
     if not offers:
         raise DeviceError(f"{options.title()}: no message with a number in {seconds:g} s in topics {topics}")
     lines = ["[driver]", 'type = "mqtt"', *_rows(place), *_rows(keys)]
     left = [f"{counted(messages.left_out, 'number')} of further topics left out"] if messages.left_out else []
     return OfferedSource(f"{options.title()}: {counted(len(offers), 'number')}", lines, offers, 0.0, remarks=left)
+
+
+def _name(number: "ObservedNumber") -> tuple[str, str]:
+    """Return the whole name of a number in messages, and the field or the last level of the topic alone."""
+    if number.path is None:
+        return number.topic, number.topic.rpartition("/")[2]
+    return f"{number.topic} {number.path}", number.path
 
 
 def _rows(keys: Mapping[str, Any]) -> list[str]:

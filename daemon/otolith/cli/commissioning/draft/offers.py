@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.cli.commissioning.draft.words import LEVELS
 from otolith.estimation.data_checks import MAD_TO_SD
 from otolith.estimation.objective import adc_step
 from otolith_drivers.units import is_unit
@@ -69,8 +70,13 @@ def noise_level(values: Array) -> float | None:
 
 
 def unit_in(name: str) -> str | None:
-    """Return the unit at the end of a name, as in ``speed_rpm`` or ``n in 1/min``; None if there is none."""
+    """Return the unit at the end of a name, as in ``speed_rpm`` or ``n in 1/min``; None if there is none.
+
+    Of a path, as ``drive/rpm``, the last name may be that of a unit.
+    """
     if (written := BEHIND_IN.search(name)) and is_unit(written[1]):
         return written[1]
-    ending = name.rpartition("_")[2]
+    whole, ending = LEVELS.split(name)[-1], name.rpartition("_")[2]
+    if len(whole) > 1 and whole != name and whole in UNIT_ENDINGS:  # a letter alone is a name, as that of a phase
+        return whole
     return ending if ending != name and ending in UNIT_ENDINGS and is_unit(ending) else None

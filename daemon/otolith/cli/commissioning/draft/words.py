@@ -5,6 +5,7 @@ import re
 UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 PART = re.compile(r"[^\W\d_]+")
 HUMP = re.compile(r"(?<=[a-zäöüß])(?=[A-ZÄÖÜ])")
+LEVELS = re.compile(r"[/.]")  # Between the names of a path
 MIN_INSIDE = 4  # letters of a word that is looked for inside others, as in Ankerspannung
 
 
@@ -72,12 +73,19 @@ def usual_unit(name: str) -> str | None:
 
 
 def meanings(name: str) -> frozenset[str]:
-    """Return what the words in ``name`` mean; a symbol counts where no word names a quantity."""
-    parts = [part.casefold().translate(UMLAUTS) for part in PART.findall(HUMP.sub(" ", name))]
-    found = {meaning for part in parts for meaning in _of_part(part)}
-    if not found & set(QUANTITIES.values()) and parts:
-        found |= {SYMBOLS[parts[0]]} if parts[0] in SYMBOLS else set()
+    """Return what the words in ``name`` mean; a symbol counts where no word names a quantity.
+
+    Of a path, as ``hall/drive/u_dc`` or ``metrics.u_dc``, the symbol is that of its last name.
+    """
+    found = {meaning for part in _parts(name) for meaning in _of_part(part)}
+    last = _parts(LEVELS.split(name.rstrip("/. "))[-1])
+    if not found & set(QUANTITIES.values()) and last and last[0] in SYMBOLS:
+        found.add(SYMBOLS[last[0]])
     return frozenset(found)
+
+
+def _parts(name: str) -> list[str]:
+    return [part.casefold().translate(UMLAUTS) for part in PART.findall(HUMP.sub(" ", name))]
 
 
 def _of_part(part: str) -> set[str]:

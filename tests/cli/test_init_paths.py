@@ -1,0 +1,62 @@
+"""Names with a path, as topics, fields and nodes have them: what they mean, and the unit at their end."""
+
+import numpy as np
+import pytest
+
+from otolith.cli.commissioning.draft.offers import unit_in
+from otolith.cli.commissioning.draft.words import meanings
+from otolith.estimation.minimisers import FitResult, gauss_newton
+from otolith.runtime.preview import duration_text
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("plain/drive7/rpm", "rpm"),
+        ("values.rpm", "rpm"),
+        ("plain/drive7/current_A", "A"),
+        ("plain/drive7/A", None),  # a phase
+        ("metrics.m", None),
+        ("rpm", None),
+        ("hall/drive/trip", None),
+    ],
+)
+def test_a_path_may_end_with_a_unit(name: str, unit: str | None) -> None:
+    assert unit_in(name) == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "meaning"),
+    [
+        ("factory/hall1/telemetry metrics.u_dc", "voltage"),
+        ("metrics.i_dc", "current"),
+        ("plain/line7/n", "speed"),
+        ("U_A", "voltage"),
+    ],
+)
+def test_the_symbol_of_a_path_is_that_of_its_last_name(name: str, meaning: str) -> None:
+    assert meaning in meanings(name)
+    assert meaning not in meanings(f"{name}/temperature")
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.9996, "0.9996 s"), (0.9985, "998 ms"), (1.001, "1.001 s")])
+def test_a_period_of_about_a_second_has_no_power_of_ten(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text
+
+
+class Diverging:
+    """Residuals that are finite at the start only."""
+
+    low, high = np.array([-10.0]), np.array([10.0])
+
+    def linearise(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return huge residuals away from zero."""
+        far = 1e200 if guess[0] else 1.0
+        return np.array([far, far]), np.array([[-1.0], [-1.0]])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_fit_that_diverges_warns_of_nothing() -> None:
+    found = gauss_newton(Diverging(), np.zeros(1), 5)
+    assert isinstance(found, FitResult)
+    assert found.guess[0] == 0.0
