@@ -1,5 +1,8 @@
 """Names with a path, as topics, fields and nodes have them: what they mean, and the unit at their end."""
 
+import shlex
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,6 +10,9 @@ from otolith.cli.commissioning.draft.offers import unit_in
 from otolith.cli.commissioning.draft.words import meanings
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.runtime.preview import duration_text
+from otolith_drivers.errors import ConfigurationError
+from tests.cli.commands import otolith, tables
+from tests.messages import assert_says, raises_saying
 
 
 @pytest.mark.parametrize(
@@ -60,3 +66,24 @@ def test_a_fit_that_diverges_warns_of_nothing() -> None:
     found = gauss_newton(Diverging(), np.zeros(1), 5)
     assert isinstance(found, FitResult)
     assert found.guess[0] == 0.0
+
+
+PERCENT = "time [s];Drehzahl [rpm];Drehmoment [%];Ausgangsfrequenz [Hz]\n" + "".join(
+    f"{0.1 * row:.1f};{1000 + 50 * (row // 20 % 3)};{50 + row // 20 % 5};{33 + row // 20 % 3}\n".replace(".", ",")
+    for row in range(200)
+)
+
+
+def test_a_percentage_of_a_fan_is_asked_for_its_rated_value_and_then_used(tmp_path: Path) -> None:
+    """The name of the file says what the machine is; the error has the options that are missing."""
+    file, data = tmp_path / "exhaust-fan.toml", tmp_path / "log.csv"
+    data.write_text(PERCENT, encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        otolith("init", file, "--csv", data)
+    message = str(caught.value)
+    assert_says(message, "twin fan", "T_m", "Drehmoment is in %", "rated value")
+    options = shlex.split(message.partition("Drehmoment is in %: ")[2].partition(",")[0].replace("FACTOR", "0.48"))
+    otolith("init", file, "--csv", data, *options)
+    assert tables(file)["signals"]["T_m"] == {"column": "Drehmoment", "scale": 0.48, "unit": "N*m"}
+    with raises_saying(ConfigurationError, "T_m from Drehmoment", "--scale", "rated value"):
+        otolith("init", file, "--csv", data, "--force", "--twin", "fan", "--signal", "T_m=Drehmoment")

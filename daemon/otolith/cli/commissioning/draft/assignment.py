@@ -61,9 +61,12 @@ def rank(
     given: Mapping[str, Offer] | None = None,
     unmeasured: Collection[str] = (),
 ) -> list[TwinProposal]:
-    """Return a proposal for each twin, the best first; ``hint`` is a text that may name the kind of machine."""
+    """Return a proposal for each twin, the best first; ``hint`` is a text that may name the kind of machine.
+
+    Of those that lack a signal, the one that lacks fewest comes first: it may have that signal in another unit.
+    """
     proposals = [propose(twin, offers, given, unmeasured, hint) for twin in twins]
-    return sorted(proposals, key=lambda row: (not row.fits, -row.points, len(row.missing), _estimated(row.twin)))
+    return sorted(proposals, key=lambda row: (len(row.missing), -row.points, _estimated(row.twin)))
 
 
 def propose(

@@ -13,7 +13,7 @@ from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, ra
 from otolith.cli.commissioning.draft.displays import displayed, with_displays
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
 from otolith.cli.commissioning.draft.questions import Questions
-from otolith.cli.commissioning.draft.words import usual_unit
+from otolith.cli.commissioning.draft.words import QUANTITIES, meanings, usual_unit
 from otolith.cli.commissioning.draft.writing import (
     MachineDraft,
     ReadSignal,
@@ -133,7 +133,7 @@ def write_draft(file: Path, source: OfferedSource, answers: Answers, questions: 
     _show(source, offers)
     if hidden := [offer.name for offer in source.offers if offer not in writable]:
         echo(f"! no machine file can name {', '.join(hidden)}: rename what has control characters", "")
-    proposal = _twin(offers, source, answers, questions)
+    proposal = _twin(offers, f"{source.title} {answers.name or file.stem}", answers, questions)
     signals, assumed = _signals(proposal, offers, answers, questions, source.doubt)
     chosen = [read.offer for read in signals.values()]
     proposed, why = f"{1e3 * proposed_period(chosen):.6g} ms", period_reason(chosen, source.period)
@@ -204,13 +204,16 @@ def _show(source: OfferedSource, offers: Sequence[Offer]) -> None:
     echo(*(f"! {remark}" for remark in source.remarks), "")
 
 
-def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, questions: Questions) -> TwinProposal:
-    """Return the twin that fits best, or the one that was told; raise ConfigurationError if none fits."""
+def _twin(offers: Sequence[Offer], hint: str, answers: Answers, questions: Questions) -> TwinProposal:
+    """Return the twin that fits best, or the one that was told; raise ConfigurationError if none fits.
+
+    ``hint`` is a text that may name the kind of machine, as the names of log and machine do.
+    """
     known = {offer.name: offer for offer in offers}
     given = {signal: known[text] for signal, text in answers.signals.items()}
     twins, told = [find_twin(name) for name in library_twins()], given.keys() | answers.unknown.keys()
     having = [twin for twin in twins if told <= set(twin.signals)] or twins
-    ranked = rank(having, offers, source.title, given, answers.unknown)
+    ranked = rank(having, offers, hint, given, answers.unknown)
     fitting = [row for row in ranked if row.fits]
     if len(fitting) > 1:
         echo(f"twins that fit: {', '.join(row.twin.name for row in fitting)}")
@@ -227,8 +230,31 @@ def _twin(offers: Sequence[Offer], source: OfferedSource, answers: Answers, ques
         lacking = "; ".join(f"{row} ({meaning_of(twin, row)}, {twin.unit_of(row)})" for row in proposal.missing)
         remedy = "--signal SIGNAL=NAME tells which signal it is, --unit NAME=UNIT its unit, --twin another twin; "
         remedy += "docs/describe-your-machine.md has how to write a twin of your own"
-        raise ConfigurationError(f"twin {name} needs what nothing offers: {lacking}: {remedy}")
+        shares = [line for row in proposal.missing for line in _percentages(twin, row, offers)]
+        raise ConfigurationError("; ".join([f"twin {name} needs what nothing offers: {lacking}: {remedy}", *shares]))
     return proposal
+
+
+def _percentages(twin: Definition, name: str, offers: Sequence[Offer]) -> list[str]:
+    """Return how to tell that a signal is one of the ``offers``, which has it in percent of a rated value."""
+    unit, wanted = twin.unit_of(name), meanings(f"{name} {meaning_of(twin, name)}") & set(QUANTITIES.values())
+    return [
+        f"{offer.name} is in {offer.unit}: --signal {_pair(name, offer.name)} {_as_percentage(offer, unit)}"
+        for offer in offers
+        if offer.unit == "%" and wanted & meanings(offer.name)
+    ]
+
+
+def _as_percentage(offer: Offer, unit: str) -> str:
+    """Return the options for a signal in percent of a rated value."""
+    factor = _pair(offer.name, "FACTOR")
+    return (
+        f"--unit {_pair(offer.name, unit)} --scale {factor}, where FACTOR is a hundredth of the rated value in {unit}"
+    )
+
+
+def _pair(name: str, value: str) -> str:
+    return shlex.quote(f"{name}={value}")
 
 
 def _signals(
@@ -290,7 +316,8 @@ def _check_unit(twin: Definition, name: str, offer: Offer, unit: str) -> None:
     try:
         factor(unit, twin.unit_of(name))
     except ValueError as error:
-        raise ConfigurationError(f"{name} from {offer.name}: {error}") from error
+        remedy = f"; {_as_percentage(offer, twin.unit_of(name))}" if unit == "%" else ""
+        raise ConfigurationError(f"{name} from {offer.name}: {error}{remedy}") from error
 
 
 def _fitting(target: str) -> Callable[[str], str]:

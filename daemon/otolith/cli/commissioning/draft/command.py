@@ -59,7 +59,7 @@ def _pairs(_: click.Context, option: click.Parameter, written: tuple[str, ...]) 
 @click.option("--unit", "units", multiple=True, callback=_pairs, metavar="NAME=UNIT",
               help="Unit of a signal of the source.")  # fmt: skip
 @click.option("--scale", "scales", multiple=True, callback=_pairs, metavar="NAME=FACTOR",
-              help="What one step of a number is worth in its unit; not for --csv.")  # fmt: skip
+              help="What one step of a number is worth in its unit, as 0.48 for percent of 48 N*m.")  # fmt: skip
 @click.option("--display", "displays", multiple=True, callback=_pairs, metavar="SIGNAL=VALUE",
               help='Of Modbus: what the display of the drive shows meanwhile, as "omega=1450 rpm".')  # fmt: skip
 @click.option("--noise", "noises", multiple=True, callback=_pairs, metavar="SIGNAL=LEVEL",
