@@ -212,7 +212,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     if with_driver and (file.drivers or file.read_signals or not for_replay):
         driver = build_driver(driver_configs(file, twin, source))
     varying = frozenset(item.name for item in unmeasured if item.assumption is Assumption.CONSTANT)
-    plan = replace(_plan(file, twin, complete, problem, context), varying=varying)
+    plan = _plan(file, twin, complete, problem, context).with_held(file.held_beside(twin, context), varying)
     return LoadedMachine(path, file, twin, problem, plan, tables, driver, complete, unmeasured, of_service)
 
 
@@ -390,11 +390,7 @@ def _plan(
 ) -> MonitoringPlan:
     """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
     free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
-    names = [row.name for row in twin.parameters]
     for name, table in file.parameters.items():
-        for other in set(table.as_right_as).difference(names):
-            fault = f"twin {twin.name!r} has no parameter {other!r}: {nearest(other, names)}"
-            context.fail(("parameters", name, "as_right_as"), fault)
         for key, written in (("watch", table.watch), ("act", table.act), ("temperature", table.temperature)):
             if written and name not in free:
                 what = "temperature" if key == "temperature" else "limit"
@@ -420,10 +416,6 @@ def _plan(
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
     known = _with_waiting_limits(known, own)
-    for name, table in file.parameters.items():
-        held = tuple(other for other in table.as_right_as if other in known)
-        rows = parameters if name in free else known
-        rows[name] = replace(rows[name], as_right_as=held)
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language, zone = file.machine.language, file.machine.timezone
     _check_rules(file, twin, context)

@@ -310,6 +310,15 @@ class MachineFile(StrictModel):
             return self.driver
         return (self.driver,) if self.driver else ()
 
+    def held_beside(self, twin: Definition, context: Context) -> dict[str, tuple[str, ...]]:
+        """Return the parameters with which others are right or wrong; ConfigurationError for one that is none."""
+        names = [row.name for row in twin.parameters]
+        for name, table in self.parameters.items():
+            for other in set(table.as_right_as).difference(names):
+                fault = f"twin {twin.name!r} has no parameter {other!r}: {nearest(other, names)}"
+                context.fail(("parameters", name, "as_right_as"), fault)
+        return {name: table.as_right_as for name, table in self.parameters.items() if table.as_right_as}
+
     @property
     def unmeasured(self) -> dict[str, dict[str, Any]]:
         """The tables of ``[signals]`` of inputs that no sensor measures, see :class:`UnmeasuredTable`."""

@@ -8,7 +8,7 @@ and none is preferred. The plan of a machine has its rows beside the limits of w
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -126,6 +126,16 @@ class MonitoringPlan:
     def texts(self) -> Texts:
         """The texts in the language of the machine."""
         return texts_in(self.language)
+
+    def with_held(self, held: Mapping[str, tuple[str, ...]], varying: frozenset[str]) -> "MonitoringPlan":
+        """Return the plan with the parameters with which others are right or wrong, and those that vary."""
+
+        def quantities(rows: Mapping[str, MonitoredQuantity]) -> dict[str, MonitoredQuantity]:
+            own = {name: tuple(other for other in held.get(name, ()) if other in self.known) for name in rows}
+            return {name: replace(row, as_right_as=own[name]) for name, row in rows.items()}
+
+        parameters, known = quantities(self.parameters), quantities(self.known)
+        return replace(self, parameters=parameters, known=known, varying=varying)
 
     def held_with(self, name: str) -> dict[str, HeldDocument]:
         """Return the held values with which the value of a parameter is right or wrong."""
