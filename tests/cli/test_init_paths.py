@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.cli.commissioning.draft.offers import unit_in
+from otolith.cli.commissioning.draft.assignment import percentages, rank
+from otolith.cli.commissioning.draft.offers import Offer, unit_in
 from otolith.cli.commissioning.draft.words import meanings
 from otolith.estimation.minimisers import FitResult, gauss_newton
+from otolith.machine import find_twin, library_twins
 from otolith.runtime.preview import duration_text
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.commands import otolith, tables
@@ -68,10 +70,9 @@ def test_a_fit_that_diverges_warns_of_nothing() -> None:
     assert found.guess[0] == 0.0
 
 
-PERCENT = "time [s];Drehzahl [rpm];Drehmoment [%];Ausgangsfrequenz [Hz]\n" + "".join(
-    f"{0.1 * row:.1f};{1000 + 50 * (row // 20 % 3)};{50 + row // 20 % 5};{33 + row // 20 % 3}\n".replace(".", ",")
-    for row in range(200)
-)
+HEADING = "time [s];Drehzahl [rpm];Drehmoment [%];Ausgangsfrequenz [Hz];Motorstrom [A]\n"
+ROWS = ((at / 10.0, 1000 + 50 * (at // 20 % 3), 50 + at // 20 % 5, 33 + at // 20 % 3, 7 + at % 5) for at in range(200))
+PERCENT = HEADING + "".join(";".join(map(str, row)).replace(".", ",") + "\n" for row in ROWS)
 
 
 def test_a_percentage_of_a_fan_is_asked_for_its_rated_value_and_then_used(tmp_path: Path) -> None:
@@ -87,3 +88,14 @@ def test_a_percentage_of_a_fan_is_asked_for_its_rated_value_and_then_used(tmp_pa
     assert tables(file)["signals"]["T_m"] == {"column": "Drehmoment", "scale": 0.48, "unit": "N*m"}
     with raises_saying(ConfigurationError, "T_m from Drehmoment", "--scale", "rated value"):
         otolith("init", file, "--csv", data, "--force", "--twin", "fan", "--signal", "T_m=Drehmoment")
+
+
+def test_currents_in_percent_are_those_of_an_induction_motor() -> None:
+    """Also its flux is named; a fan, which would lack one signal only, has no output frequency and voltage."""
+    names = {"speed": "rpm", "torque current": "%", "magnetising current": "%", "output frequency": "Hz",
+             "output voltage": "V", "DC link": "V"}  # fmt: skip
+    offers = [Offer(name, unit, {}, np.linspace(20.0, 45.0, 30)) for name, unit in names.items()]
+    first = rank([find_twin(name) for name in library_twins()], offers)[0]
+    assert first.twin.name == "induction_motor"
+    found = {signal: offer.name for signal, offer in percentages(first, offers).items()}
+    assert (found["i_d"], found["i_q"]) == ("magnetising current", "torque current")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -25,6 +25,7 @@ STILL = -1.0  # a value that never changes
 LEAST = 2.0  # points from which a pair is proposed
 UNMEASURED = 1.0  # points that a twin loses by each input without a sensor
 MACHINE = 2.0  # points of a twin whose kind of machine the source names
+KINDS = {"fan", "pump", "piston"}  # Words for the kind of a machine
 BEYOND = 3.0  # times a bound: a value beyond is of another signal or unit
 
 
@@ -63,10 +64,34 @@ def rank(
 ) -> list[TwinProposal]:
     """Return a proposal for each twin, the best first; ``hint`` is a text that may name the kind of machine.
 
-    Of those that lack a signal, the one that lacks fewest comes first: it may have that signal in another unit.
+    Of those that lack a signal, the one that lacks fewest comes first; what is there in percent it has if told of what.
     """
+
+    def lost(row: TwinProposal) -> int:
+        found = percentages(row, offers)
+        driven = {item.name for item in row.twin.inputs if item.has_range and found.keys() & set(row.unmeasured)}
+        return len(set(row.missing) - found.keys() - driven)
+
+    def other_kind(row: TwinProposal) -> bool:
+        return bool(meanings(hint) & KINDS) and not meanings(hint) & KINDS & meanings(row.twin.title)
+
     proposals = [propose(twin, offers, given, unmeasured, hint) for twin in twins]
-    return sorted(proposals, key=lambda row: (len(row.missing), -row.points, _estimated(row.twin)))
+    best = sorted(proposals, key=lambda row: (-row.points, _estimated(row.twin)))
+    return sorted(best, key=lambda row: (not row.fits, not row.fits and (lost(row), other_kind(row))))
+
+
+def percentages(proposal: TwinProposal, offers: Sequence[Offer]) -> dict[str, Offer]:
+    """Return the offers that are in percent of a rated value, by the missing signal that each may be by its name."""
+    twin, found = proposal.twin, dict[str, Offer]()
+    signals: list[Input | Output] = [*twin.inputs, *twin.outputs]
+    for offer in offers:
+        left = [row for row in signals if row.name in proposal.missing and row.name not in found]
+        points = {row.name: _of_words(twin, row, replace(offer, unit=None)) for row in left if offer.unit == "%"}
+        words = {row.name: len(meanings(offer.name) & meanings(f"{row.name} {row.meaning}")) for row in left}
+        best = max(points, key=lambda name: (points[name], words[name]), default="")
+        if best and points[best] > 0.0:
+            found[best] = offer
+    return found
 
 
 def propose(
@@ -99,7 +124,7 @@ def propose(
     missing = [row.name for row in twin.outputs if row.name not in pairs]
     missing += [row.name for row in inputs if not (row.has_range and driven)]
     named = meanings(hint) | {meaning for offer in offers for meaning in meanings(offer.name)}
-    kind = MACHINE if named & meanings(twin.title) & {"fan", "pump", "piston"} else 0.0
+    kind = MACHINE if named & meanings(twin.title) & KINDS else 0.0
     total = sum(pair.points for pair in pairs.values()) - UNMEASURED * len(inputs) + kind
     return TwinProposal(twin, pairs, total, tuple(missing), tuple(row.name for row in inputs), others)
 

@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from otolith.cli.commissioning.draft.answers import Answers
-from otolith.cli.commissioning.draft.assignment import TwinProposal, propose, rank
+from otolith.cli.commissioning.draft.assignment import TwinProposal, percentages, propose, rank
 from otolith.cli.commissioning.draft.displays import displayed, with_displays
 from otolith.cli.commissioning.draft.offers import Offer, OfferedSource
 from otolith.cli.commissioning.draft.questions import Questions
-from otolith.cli.commissioning.draft.words import QUANTITIES, meanings, usual_unit
+from otolith.cli.commissioning.draft.words import usual_unit
 from otolith.cli.commissioning.draft.writing import (
     MachineDraft,
     ReadSignal,
@@ -230,19 +230,12 @@ def _twin(offers: Sequence[Offer], hint: str, answers: Answers, questions: Quest
         lacking = "; ".join(f"{row} ({meaning_of(twin, row)}, {twin.unit_of(row)})" for row in proposal.missing)
         remedy = "--signal SIGNAL=NAME tells which signal it is, --unit NAME=UNIT its unit, --twin another twin; "
         remedy += "docs/describe-your-machine.md has how to write a twin of your own"
-        shares = [line for row in proposal.missing for line in _percentages(twin, row, offers)]
+        shares = [
+            f"{offer.name} is in %: --signal {_pair(row, offer.name)} {_as_percentage(offer, twin.unit_of(row))}"
+            for row, offer in percentages(proposal, offers).items()
+        ]
         raise ConfigurationError("; ".join([f"twin {name} needs what nothing offers: {lacking}: {remedy}", *shares]))
     return proposal
-
-
-def _percentages(twin: Definition, name: str, offers: Sequence[Offer]) -> list[str]:
-    """Return how to tell that a signal is one of the ``offers``, which has it in percent of a rated value."""
-    unit, wanted = twin.unit_of(name), meanings(f"{name} {meaning_of(twin, name)}") & set(QUANTITIES.values())
-    return [
-        f"{offer.name} is in {offer.unit}: --signal {_pair(name, offer.name)} {_as_percentage(offer, unit)}"
-        for offer in offers
-        if offer.unit == "%" and wanted & meanings(offer.name)
-    ]
 
 
 def _as_percentage(offer: Offer, unit: str) -> str:
