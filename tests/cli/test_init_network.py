@@ -24,7 +24,7 @@ from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.mqtt import MqttOptions
 from otolith_drivers.mqtt_probe import ObservedMessages
 from otolith_drivers.opcua import connection
-from otolith_drivers.opcua.watching import Changes
+from otolith_drivers.opcua.watching import VariableChanges
 from otolith_drivers.units import Quantity
 from tests.cli.commands import otolith, tables
 from tests.conftest import free_port
@@ -251,7 +251,7 @@ def test_the_sample_period_of_a_server_is_that_with_which_its_variables_change(
     steps: list[float], interval: float | None
 ) -> None:
     """The interval of the subscription is that of its messages, which says nothing of the variables."""
-    changes = Changes(np.cumsum([1.8e9, *steps]).tolist(), [0.0] * (len(steps) + 1))
+    changes = VariableChanges(np.cumsum([1.8e9, *steps]).tolist(), [0.0] * (len(steps) + 1))
     assert changes.interval == (None if interval is None else pytest.approx(interval, rel=1e-3))
 
 

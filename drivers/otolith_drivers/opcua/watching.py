@@ -22,7 +22,7 @@ PAUSE = 0.05  # s between two looks at the clock
 
 
 @dataclass(slots=True)
-class Changes:
+class VariableChanges:
     """The numbers that a variable has had, with their times."""
 
     times: list[float] = field(default_factory=list)  # Unix s; of the source, else of the server
@@ -40,7 +40,7 @@ class Changes:
 class _Receiver:
     """Takes the notifications of a subscription."""
 
-    changes: dict[ua.NodeId, Changes]
+    changes: dict[ua.NodeId, VariableChanges]
 
     def datachange_notification(self, node: Any, value: Any, data: DataChangeNotif) -> None:
         """Keep a number; the library calls this for each change."""
@@ -58,11 +58,11 @@ def is_number(value: object) -> bool:
 
 async def watch(
     client: Client, variables: Sequence[Variable], seconds: float, stopped: Callable[[], bool]
-) -> list[Changes]:
+) -> list[VariableChanges]:
     """Return how each of ``variables`` changes within ``seconds``; its first number is the present one."""
     spaces = await namespaces(client)
     nodes = [place(variable.node, spaces, "").node for variable in variables]
-    changes = {node: Changes() for node in nodes}
+    changes = {node: VariableChanges() for node in nodes}
     subscription = await client.create_subscription(1e3 * PUBLISHING, _Receiver(changes))
     queue = int(4.0 * PUBLISHING / SAMPLING)
     await subscription.subscribe_data_change(

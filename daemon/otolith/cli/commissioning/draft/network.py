@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from otolith_drivers.modbus.probe import Number
     from otolith_drivers.mqtt_probe import ObservedNumber
     from otolith_drivers.opcua.connection import OpcuaOptions, Variable
-    from otolith_drivers.opcua.watching import Changes
+    from otolith_drivers.opcua.watching import VariableChanges
 
 MAX_VARIABLES = 500  # of a server that are read
 RENEWALS = "that with which its registers change while the machine moves, as far as the device answers so often"
@@ -154,7 +154,7 @@ def server_offers(
 
 async def _watched(
     options: "OpcuaOptions", folder: Path, seconds: float, stop: StopSignal, show: Callable[[str], None]
-) -> "list[tuple[Variable, Changes]]":
+) -> "list[tuple[Variable, VariableChanges]]":
     """Return the variables of a server that are numbers, and how they change."""
     from otolith_drivers.opcua.connection import browse
     from otolith_drivers.opcua.watching import is_number, watch
