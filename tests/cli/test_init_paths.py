@@ -14,7 +14,7 @@ from otolith.machine import find_twin, library_twins
 from otolith.runtime.preview import duration_text
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.commands import otolith, tables
-from tests.messages import assert_says, raises_saying
+from tests.messages import assert_each_says, assert_says, raises_saying
 
 
 @pytest.mark.parametrize(
@@ -99,3 +99,14 @@ def test_currents_in_percent_are_those_of_an_induction_motor() -> None:
     assert first.twin.name == "induction_motor"
     found = {signal: offer.name for signal, offer in percentages(first, offers).items()}
     assert (found["i_d"], found["i_q"]) == ("magnetising current", "torque current")
+
+
+def test_what_is_an_amplitude_is_said_unless_its_scale_was_told(tmp_path: Path) -> None:
+    """Converters show effective values, of a voltage those between two phases: 18 % or 41 % beside the amplitude."""
+    file, data = tmp_path / "motor.toml", tmp_path / "log.csv"
+    rows = ((0.02 * at, 900 + at % 50, 3.0 + at % 3, 4.0, 30 + at % 4, 300 + at % 20) for at in range(300))
+    heading = "time [s],speed [rpm],torque current [A],magnetising current [A],output frequency [Hz],output voltage [V]"
+    data.write_text("\n".join([heading, *(",".join(map(str, row)) for row in rows), ""]), encoding="utf-8")
+    said = otolith("init", file, "--csv", data, "--scale", "output voltage=0.8165").stdout
+    remarks = [line for line in said.splitlines() if "amplitude; " in line]
+    assert_each_says(remarks, ("magnetising current=1.41421",), ("torque current=1.41421",))

@@ -37,6 +37,7 @@ from otolith_drivers.outside_text import CONTROL
 from otolith_drivers.units import Quantity, factor, is_unit
 
 ASSUMPTIONS = [kind.value for kind in Assumption if kind is not Assumption.PROPORTIONAL]  # which needs an expression
+AMPLITUDES = "amplitude"  # In the validity of a twin whose currents and voltages are no effective values
 MAX_SHOWN = 40  # rows of the table of offers
 
 
@@ -240,10 +241,9 @@ def _twin(offers: Sequence[Offer], hint: str, answers: Answers, questions: Quest
 
 def _as_percentage(offer: Offer, unit: str) -> str:
     """Return the options for a signal in percent of a rated value."""
-    factor = _pair(offer.name, "FACTOR")
-    return (
-        f"--unit {_pair(offer.name, unit)} --scale {factor}, where FACTOR is a hundredth of the rated value in {unit}"
-    )
+    options = f"--unit {_pair(offer.name, unit)} --scale {_pair(offer.name, 'FACTOR')}"
+    effective = ", times 1.41421 for an effective value of a three-phase motor" if unit == "A" else ""
+    return f"{options}, where FACTOR is a hundredth of the rated value in {unit}{effective}"
 
 
 def _pair(name: str, value: str) -> str:
@@ -276,6 +276,8 @@ def _signals(
         others = proposal.others.get(name, ()) if pair and pair.offer.name == text else ()
         read[name] = _read(twin, name, known[text], why, answers, questions)
         echo(f"  {what}: {text} [{read[name].unit}], {read[name].remark}")
+        if twin.unit_of(name) in ("A", "V") and AMPLITUDES in twin.validity and text not in answers.scales:
+            echo(f"  ! an amplitude; of an effective value: --scale {_pair(text, '1.41421')}, between phases 0.8165")
         if others:
             echo(f"  ! {', '.join(others)} would be as likely: --signal {name}=NAME decides")
     return read, assumed
