@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from otolith.acquisition.window import Window
-from otolith.commissioning.dependence import MATERIAL, TOLERANCE, dependences
+from otolith.commissioning.dependence import MATERIAL, TOLERANCE, dependences, is_count
 from otolith.commissioning.own_values import own_values
 from otolith.commissioning.value_search import OwnValue
 from otolith.estimation.information import QUANTILE
@@ -126,3 +126,13 @@ def test_a_dependence_is_stated_or_added_to_the_interval(
     assert [(row.name, row.value) for row in found] == ([("K", -3.0)] if depends else [])
     assert [abs(row.share) for row in found] == pytest.approx([share] if depends else [])
     assert added == pytest.approx(wider * size)
+
+
+@pytest.mark.parametrize(
+    ("twin", "name", "value", "expected"),
+    [("induction_motor", "n_p", 2.0, True), ("induction_motor", "n_p", 2.5, False), ("dc_motor", "R_a", 6.0, False)],
+)
+def test_a_number_of_pole_pairs_that_is_stated_has_no_tolerance(
+    twin: str, name: str, value: float, expected: bool
+) -> None:
+    assert is_count(find_twin(twin).parameter(name), value) is expected

@@ -16,6 +16,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.commissioning.shared_fit import SharedFit, projected
+from otolith.twin.definition import Parameter
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 TOLERANCE = 0.1  # of a value that a machine file states: by how much it may be wrong
@@ -29,6 +30,11 @@ class Dependence:
     name: str
     value: float  # At which it is held, in the unit of the twin
     share: float  # Relative change of the dependent value by a relative change of this one
+
+
+def is_count(parameter: Parameter, value: float) -> bool:
+    """Whether a value is a number of things, as that of pole pairs: one that a file states has no tolerance."""
+    return parameter.unit == "1" and value >= 1.0 and float(value).is_integer()
 
 
 def responses(together: SharedFit, guess: Array, held: Sequence[str], names: Sequence[str]) -> dict[str, Array]:

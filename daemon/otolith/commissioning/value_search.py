@@ -7,7 +7,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.commissioning.constancy import ValueChange
-from otolith.commissioning.dependence import Dependence, dependences, responses
+from otolith.commissioning.dependence import Dependence, dependences, is_count, responses
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
@@ -344,7 +344,11 @@ class ValueSearch:
         """Return the values of the held parameters; and by how much a unit of each moves those that were fitted."""
         twin, count = stage.problem.base_model, len(stage.parameters)
         own = {row.name: row for row in twin.parameters if row.role is not Role.SETTING}
-        held = {name: value for name, value in stage.problem.known if name in own}
+        held = {
+            name: value
+            for name, value in stage.problem.known
+            if name in own and not (name in self._stated and is_count(own[name], value))
+        }
         rows = [replace(own[name], nominal=value) for name, value in held.items()]
         known = tuple(pair for pair in stage.problem.known if pair[0] not in held)
         problem = replace(stage.problem, known=known, free=(*stage.problem.free, *rows))
