@@ -361,10 +361,7 @@ def _before_the_last_run(doubtful: tuple[int, ...], now: int) -> tuple[int, ...]
 
 
 def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, object]:
-    """Return the baseline of a parameter, its limit, and its value at the reference temperature if one is measured.
-
-    Also whether its nominal value is of another machine, and with which held values it is right or wrong.
-    """
+    """Return what the plan adds to a parameter: baseline, limit, value at the reference temperature, held values."""
     quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
     judged: dict[str, object] = {"baseline": quantity.nominal} if quantity.has_baseline else {}
     judged |= {"is_example": True} if quantity.is_example else {}
