@@ -245,11 +245,12 @@ TWO_MASS = Plant(
 
 
 def _pmsm_rates(x: Values, u: Values, q: Values) -> Values:
-    speed = q["n_p"] * x["omega"]
-    torque = 1.5 * q["n_p"] * x["i_q"] * (q["psi"] + (q["L_d"] - q["L_q"]) * x["i_d"]) * (1.0 + q["torque"])
+    speed, inductance = q["n_p"] * x["omega"], q["L_q"] / (1.0 + q["s_q"] * np.abs(x["i_q"]))
+    lost = q["V_dt"] / np.sqrt(x["i_d"] ** 2 + x["i_q"] ** 2 + q["i_s"] ** 2)
+    torque = 1.5 * q["n_p"] * x["i_q"] * (q["psi"] + (q["L_d"] - inductance) * x["i_d"]) * (1.0 + q["torque"])
     return {
-        "i_d": (u["v_d"] - q["R_s"] * x["i_d"] + speed * q["L_q"] * x["i_q"]) / q["L_d"],
-        "i_q": (u["v_q"] - q["R_s"] * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / q["L_q"],
+        "i_d": (u["v_d"] - (q["R_s"] + lost) * x["i_d"] + speed * inductance * x["i_q"]) / q["L_d"],
+        "i_q": (u["v_q"] - (q["R_s"] + lost) * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / inductance,
         "omega": (torque - u["T_load"] - q["D"] * x["omega"] + q["shaft"]) / q["J"],
     }
 
@@ -267,7 +268,18 @@ PMSM = Plant(
     twin="pmsm",
     period=0.002,
     records=250,
-    parameters={"R_s": 1.2, "L_d": 8.5e-3, "L_q": 9.5e-3, "psi": 0.175, "n_p": 4.0, "J": 0.008, "D": 0.002},
+    parameters={
+        "R_s": 1.2,
+        "L_d": 8.5e-3,
+        "L_q": 9.5e-3,
+        "psi": 0.175,
+        "s_q": 0.0,
+        "V_dt": 0.0,
+        "i_s": 0.5,
+        "n_p": 4.0,
+        "J": 0.008,
+        "D": 0.002,
+    },
     sites=("shaft", "torque"),
     initial={"i_d": 0.0, "i_q": 0.0, "omega": 40.0},
     rates=_pmsm_rates,
