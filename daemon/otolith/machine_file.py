@@ -23,7 +23,7 @@ from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
 from otolith.outlet_tables import OutletsTable
 from otolith.twin.definition import Definition
-from otolith.twin.language import OwnFigureTable
+from otolith.twin.language import OperationTable, OwnFigureTable
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.time_zones import check_time_zone
@@ -290,6 +290,8 @@ class MachineFile(StrictModel):
     components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]  # Limits of amplitudes, by site
     performance: Annotated[dict[str, OwnFigureTable], Field(default_factory=dict)]
     """Figures of performance, and other keys of those of the twin, by name."""
+    operation: Annotated[dict[str, OperationTable], Field(default_factory=dict)]
+    """Ranges of signals in which the equations of the twin hold."""
     rule: tuple[OwnRule, ...] = ()  # Of the diagnosis, before the packaged ones
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # Standard deviation of each sensor
     process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # In the state's unit per s^0.5

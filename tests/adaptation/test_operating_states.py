@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.changes.machines import LIBRARY_PLANTS
+from benchmarks.changes.plants import cut
 from benchmarks.diagnosis import machine_of
 from benchmarks.everyday import (
     NOISE,
@@ -17,12 +19,18 @@ from benchmarks.everyday import (
     run_of,
     simulate,
 )
+from benchmarks.other_situations import machine_with
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.operating_states import MIN_OFF, off_records, running_part
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.operating_states import MIN_OFF, off_records, part_in_operation, running_part
+from otolith.adaptation.state import initial_state
+from otolith.health.schema import Status
+from otolith.machine import LoadedMachine
 from tests.variants import often
 
 MOTOR = machine_of("motor").problem
+PARTS = 100  # of a record of the pump, for Euler's method
 STOPS = Machine(enabled=lambda time: time % 40.0 < 28.0)
 
 
@@ -101,3 +109,53 @@ def test_an_offset_is_not_severe_because_the_machine_stands_still() -> None:
     outcome = run_of(Situation("offset", stops, ("sensor",)), 1)
     assert outcome.verdict == "right", outcome.story
     assert not any(" ACT " in line for line in outcome.story), outcome.story
+
+
+def _pump_that_rests(seed: int, seconds: float) -> tuple[LoadedMachine, list[Window]]:
+    """Return windows of 5 s of a pump that rests for 20 s of each minute, while a check valve holds the water."""
+    plant, random, machine = LIBRARY_PLANTS["pump"], np.random.default_rng(seed), machine_with("pump")
+    q, speed, flow, rows = plant.parameters, 150.0, 20.0 / 3600.0, list[tuple[float, ...]]()
+    for record in range(round(seconds / plant.period)):
+        time = record * plant.period
+        torque, opening = 0.0 if time % 60.0 > 40.0 else 9.0, 0.8 + 0.1 * float(np.sin(0.2 * time))
+        change = 0.8 + 0.1 * float(np.sin(0.2 * (time + plant.period))) - opening
+        rows.append((torque, opening, speed, 3600.0 * flow, 1e-3 * (q["h_0"] * speed**2 - q["h_2"] * flow**2)))
+        for part in range(PARTS):
+            now = opening + change * (part + 0.5) / PARTS
+            pressure = q["h_0"] * speed**2 - q["h_2"] * flow**2
+            friction = q["T_c"] if speed > 0.0 else min(torque, q["T_c"])
+            rate = (torque - q["t_1"] * speed * flow - q["t_0"] * speed**2 - friction) / q["J"]
+            rise = (pressure - q["p_static"] - q["k_v"] * (flow / now) ** 2) / q["I_p"]
+            speed = max(speed + rate * plant.period / PARTS, 0.0)
+            flow = max(flow + rise * plant.period / PARTS, 0.0)
+    noise = [0.0, 0.0, *(output.noise for output in machine.twin.outputs)]
+    values = np.array(rows) + noise * random.standard_normal((len(rows), 5))
+    measured = dict(zip(("T_m", "u", "omega", "Q", "p"), values.T, strict=True))
+    return machine, cut(plant, measured, machine.twin.signals)
+
+
+@pytest.mark.parametrize("seed", often([1], [1, 2, 3]))
+def test_a_pump_that_rests_behind_its_check_valve_is_no_event(seed: int) -> None:
+    machine, windows = _pump_that_rests(seed, 125.0)
+    state, covered, reasons = initial_state("m", "s", machine.problem, machine.plan), [], set[str]()
+    for window in windows:
+        state, report = adapt(state, window)
+        assert not [event.text for event in report.document.events if not event.is_hint]
+        item = report.document.parameters["h_0"]
+        if item.status is Status.ESTIMATED and item.low is not None and item.high is not None:
+            covered.append(item.low <= 11.5 <= item.high)
+        reasons.add(item.reason)
+    assert sum(covered) >= 0.9 * len(covered) > 10
+    assert any("Q was below 1 m³/h" in reason for reason in reasons)
+
+
+def test_a_wrong_reading_is_no_stop() -> None:
+    machine, windows = _pump_that_rests(1, 10.0)
+    values = windows[1].values.copy()
+    values[100 : 100 + MIN_OFF - 1, machine.twin.signals.index("Q")] = 0.0
+    assert part_in_operation(machine.problem, replace(windows[1], values=values)) is None
+    values[100 : 100 + MIN_OFF, machine.twin.signals.index("Q")] = 0.0
+    part = part_in_operation(machine.problem, replace(windows[1], values=values))
+    assert part is not None
+    assert part.window is not None
+    assert part.window.records == len(values) - 100 - MIN_OFF

@@ -24,7 +24,7 @@ from tests.variants import often_rows
 SATURATION, DEAD_TIME = 0.01, 1.2  # 1/A, and V of each half bridge
 SOFT = 0.05  # A: current within which the voltage of a half bridge changes its sign
 FUNDAMENTAL = 4.0 / np.pi  # of a square wave, over its height
-SHAPE = 0.15  # of a value: how much the machine's curves differ from those of the twin
+CURRENT = 8.0  # A, of the quadrature axis under load
 PHASES = np.array([0.0, 2.0, 4.0]) * np.pi / 3.0
 ROWS = often_rows([(SATURATION, False)], [(SATURATION, False), (SATURATION, True), (0.0, False), (0.0, True)])
 COMMISSIONED, SECONDS = 20, 20.0  # windows of the healthy record; s
@@ -108,10 +108,11 @@ def _commissioned(saturation: float, dead_time: bool) -> tuple[Problem, dict[str
 @pytest.mark.parametrize(("saturation", "dead_time"), ROWS)
 def test_a_healthy_record_shows_what_converter_and_iron_do(saturation: float, dead_time: bool) -> None:
     found = _commissioned(saturation, dead_time)[1]
-    for name, truth in (("s_q", saturation), ("V_dt", FUNDAMENTAL * DEAD_TIME * dead_time)):
-        value, sd = found[name]
-        # The twin has another curve of the same slope, and only the fundamental of the square waves.
-        assert abs(value - truth) < SHAPE * truth if truth else sd is None and value == 0.0
+    slope, voltage = found["s_q"], found["V_dt"]
+    assert slope == (0.0, None) if not saturation else slope[1] is not None
+    inductance = found["L_q"][0] / (1.0 + slope[0] * CURRENT)
+    assert abs(inductance / (9.5 * (1.0 - saturation * CURRENT)) - 1.0) < 0.01  # the machine has another curve
+    assert voltage == (0.0, None) if not dead_time else abs(voltage[0] / (FUNDAMENTAL * DEAD_TIME) - 1.0) < 0.05
     value, sd = found["R_s"]
     assert sd is not None
     assert abs(value - PMSM.parameters["R_s"]) < 1.5 * QUANTILE * sd + 0.02 * dead_time

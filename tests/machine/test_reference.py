@@ -11,6 +11,7 @@ from otolith import machine_file
 from otolith.fmu_twin import VariableTable
 from otolith.health.diagnosis import OwnRule
 from otolith.outlet_tables import PrometheusOutlet
+from otolith.twin.language import OperationTable
 from otolith_drivers.canbus import driver as can
 from otolith_drivers.canbus.options import MessageTable, PdoTable
 from otolith_drivers.modbus import driver as modbus
@@ -29,6 +30,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[parameters]", "key", machine_file.ParameterTable),
     ("[components]", "key", machine_file.LimitsTable),
     ("[[rule]]", "key", OwnRule),
+    ("[operation]", "key", OperationTable),
     ("unknown", "key of an unmeasured input", machine_file.UnmeasuredTable),
     ("[window]", "key", machine_file.WindowTable),
     ("[estimation]", "key", machine_file.EstimationTable),

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from otolith.machine import LIBRARY, find_twin, load_twin
+from otolith.machine import LIBRARY, find_twin, load_machine, load_twin
 from otolith.machine import library_twins as library
 from otolith.twin.expressions import (
     FUNCTIONS,
@@ -29,7 +29,7 @@ from otolith.twin.language import read_twin
 from otolith.twin.symbolic import to_sympy
 from otolith_drivers.config_files import SourceFile
 from otolith_drivers.errors import ConfigurationError
-from tests.messages import assert_refuses, assert_says_what_is_listed
+from tests.messages import assert_refuses, assert_says_what_is_listed, raises_saying
 from tests.twin.reference import Reference
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "twins"
@@ -241,3 +241,31 @@ def test_only_checked_names_reach_generated_code() -> None:
     for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
         with pytest.raises(ConfigurationError, match=r"is not a name|control character"):
             read_twin(SourceFile(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("omeg = { above = 1 }", ("omeg", "did you mean")),
+        ("J = { above = 1 }", ("no signal",)),
+        ("omega = {}", ("omega", "state one")),
+        ("omega = { above = 5, below = 5 }", ("above 5", "below 5")),
+        ('omega = { above = "3 V" }', ("omega", "V")),
+    ],
+)
+def test_a_wrong_range_of_operation_is_refused(row: str, said: tuple[str, ...], tmp_path: Path) -> None:
+    path = tmp_path / "twin.toml"
+    path.write_text(f"{BASE}\n[operation]\n{row}\n", encoding="utf-8")
+    with raises_saying(ConfigurationError, str(path), "operation", *said):
+        load_twin(path)
+
+
+def test_a_machine_file_replaces_the_range_of_a_signal(tmp_path: Path) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(
+        f'[machine]\nname = "m"\n[twin]\nfile = "{LIBRARY / "pump"}.toml"\n'
+        '[operation]\nQ = { above = "1 l/s" }\nu = { above = 0.2, below = 0.9 }\n',
+        encoding="utf-8",
+    )
+    ranges = {own.signal: (own.low, own.high) for own in load_machine(path, with_driver=False).twin.operation}
+    assert ranges == {"Q": (pytest.approx(3.6), np.inf), "omega": (10.0, np.inf), "u": (0.2, 0.9)}

@@ -13,7 +13,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window, larger_sizes
 from otolith.adaptation.frozen_sensors import frozen_readings, with_still_frozen
-from otolith.adaptation.operating_states import running_part
+from otolith.adaptation.operating_states import part_in_operation, running_part
 from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
@@ -73,9 +73,11 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     - **Report** estimates, findings and events.
     """
     used, shortened = last_records(window)
-    state, predicted, checked = _predict_and_check(state, used)
-    tested, checked = _fit(state, predicted, checked)
-    part = None if tested is None or tested.is_expected else running_part(predicted.problem, used)
+    part = part_in_operation(state.posterior.problem, used)
+    if part is None:
+        state, predicted, checked = _predict_and_check(state, used)
+        tested, checked = _fit(state, predicted, checked)
+        part = None if tested is None or tested.is_expected else running_part(predicted.problem, used)
     if part is not None:
         shortened = (*shortened, part.note)
         used = part.window or used

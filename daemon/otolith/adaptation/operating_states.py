@@ -1,8 +1,9 @@
-"""Stretches of a window in which the drive is switched off: its command is then not the voltage at the machine.
+"""Stretches of a window in which the equations of the twin do not hold.
 
-While a bridge is open, no current flows whatever the command says, and a brake or gear may hold the load. The equations
-of the twin do not hold there, so that such a stretch is evidence of nothing. It is recognised by a command of zero
-volts, in whose equation the current is zero within its noise, in a window that contradicts the twin.
+A twin or a machine file states outside of which ranges of its signals that is so. A drive that is switched off need not
+be stated. While a bridge is open, no current flows whatever the command says, and a brake or gear may hold the load. It
+is recognised by a command of zero volts, in whose equation the current is zero within its noise, in a window that
+contradicts the twin. Such a stretch is evidence of nothing.
 """
 
 from dataclasses import dataclass
@@ -12,12 +13,12 @@ import numpy as np
 
 from otolith.acquisition.window import Mask, Window, runs_of
 from otolith.estimation.evidence import SIGNIFICANT_DEVIATE
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, outside_of
 from otolith.twin.definition import Definition
 from otolith.twin.expressions import names_in, parse
-from otolith_drivers.units import are_of_one_quantity
+from otolith_drivers.units import are_of_one_quantity, unit_text
 
-MIN_OFF = 5  # records without a command from which on a drive is off
+MIN_OFF = 5  # records without a command, or outside of a range, from which on the equations do not hold
 SWITCHING = 3  # records within which the current of an open bridge ends
 OFF_SHARE = 0.95  # of the records of a stretch whose current is zero within its noise
 MIN_ON_SHARE = 0.25  # of the records of a window: less between two stretches is not estimated from
@@ -31,14 +32,32 @@ class RunningPart:
     note: str
 
 
+def part_in_operation(problem: Problem, window: Window) -> RunningPart | None:
+    """Return the longest part of ``window`` in which the twin states that its equations hold; None if that is all."""
+    off, reasons = np.zeros(window.records, dtype=np.bool_), list[str]()
+    for own in problem.base_model.operation:
+        runs = [run for run in runs_of(outside_of(own, window)) if run[1] - run[0] >= MIN_OFF]
+        for start, end in runs:  # a shorter one is a wrong reading
+            off[start:end] = True
+        if runs:
+            unit = unit_text(problem.base_model.unit_of(own.signal))
+            is_below = window.readings(own.signal)[runs[0][0]] < own.low
+            reasons.append(
+                f"{own.signal} was {'below' if is_below else 'above'} {own.low if is_below else own.high:g} {unit}"
+            )
+    return _longest_part(window, off, " and ".join(reasons)) if reasons else None
+
+
 def running_part(problem: Problem, window: Window) -> RunningPart | None:
     """Return the longest part of ``window`` in which the drive is on; None if it is so all the time."""
     off = off_records(problem, window)
-    if not off.any():
-        return None
+    return _longest_part(window, off, "the drive was switched off") if off.any() else None
+
+
+def _longest_part(window: Window, off: Mask, why: str) -> RunningPart:
     runs = [(start, end) for start, end in runs_of(~off) if end - start >= MIN_ON_SHARE * window.records]
     seconds = float(window.grid.steps[off].sum())
-    note = f"the drive was switched off for {seconds:.3g} s, in which no equation of the twin holds"
+    note = f"{why} for {seconds:.3g} s, in which no equation of the twin holds"
     if not runs:
         return RunningPart(None, note)
     start, end = max(runs, key=lambda run: run[1] - run[0])

@@ -43,7 +43,7 @@ from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_d
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.global_search import search_window
 from otolith.estimation.objective import Objective
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, out_of_operation
 from otolith.twin.definition import Definition
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
@@ -410,14 +410,15 @@ def _initial_levels(problem: Problem, usable: Sequence[Window]) -> _InitialLevel
 
 
 def usable_windows(problem: Problem, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows that are well sampled and complete."""
+    """Return the windows that are well sampled and complete, and in which the equations hold."""
     return [window for window in windows if _is_usable(problem, window)]
 
 
 def _is_usable(problem: Problem, window: Window) -> bool:
     samples = max(int((~window.missing_in(output.name)).sum()) for output in problem.base_model.outputs)
     sampled = window.quality.verdict is Verdict.GOOD and samples >= MIN_RECORDS
-    return sampled and bool((np.isfinite(window.values) | window.missing).all())
+    complete = bool((np.isfinite(window.values) | window.missing).all())
+    return sampled and complete and not out_of_operation(problem.base_model, window).any()
 
 
 def sample_noise(output: str, windows: Sequence[Window]) -> float:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from otolith.acquisition.samples import Check
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.sensor_models import SensorModel
 from otolith.twin.components import (
     MAX_COMPONENTS,
@@ -27,7 +27,7 @@ from otolith.twin.components import (
     source_setting,
     sources,
 )
-from otolith.twin.definition import Definition, Parameter, Site
+from otolith.twin.definition import Definition, OperatingRange, Parameter, Site
 
 UNLIMITED = 1e30  # bound of an amplitude that nothing limits; any finite number would do
 MIN_SCALE = 0.01  # share of the width of the bounds: the size of a parameter whose nominal value is about zero
@@ -310,3 +310,19 @@ def equation(twin: Definition, component: Component, values: Sequence[float]) ->
     site = site_of(twin, component.site)
     text = f"{text}·{site.into}" if site.through == site.into else text  # in proportion to what a sensor shows
     return text if site.unit == "1" else f"{text} {site.unit}"
+
+
+def outside_of(own: OperatingRange, window: Window) -> Mask:
+    """Return where a signal is outside of a range (records,); it stays where it was until it is measured again."""
+    is_outside = (window.readings(own.signal) < own.low) | (window.readings(own.signal) > own.high)
+    measured = np.flatnonzero(~window.missing_in(own.signal))
+    if not len(measured):
+        return np.zeros(window.records, dtype=np.bool_)
+    last = np.searchsorted(measured, np.arange(window.records), side="right") - 1
+    return np.asarray(is_outside[measured[np.maximum(last, 0)]], dtype=np.bool_)
+
+
+def out_of_operation(twin: Definition, window: Window) -> Mask:
+    """Return where the equations of a twin need not hold (records,), as it states."""
+    outside = [outside_of(own, window) for own in twin.operation]
+    return np.any(outside, axis=0) if outside else np.zeros(window.records, dtype=np.bool_)

@@ -117,6 +117,15 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
+class OperatingRange:
+    """Where the equations hold: while a signal is within a range, in its unit."""
+
+    signal: str
+    low: float = -math.inf
+    high: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
 class Definition:
     """A twin: its quantities and equations."""
 
@@ -133,6 +142,7 @@ class Definition:
     definitions: tuple[tuple[str, str, str], ...] = ()  # Name, expression and meaning, in the author's order
     sites: tuple[Site, ...] = ()
     performance: tuple[Figure, ...] = ()
+    operation: tuple[OperatingRange, ...] = ()  # Outside of any of them, a machine may do what no equation says
     base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.components)
     fmu: FmuReference | None = None  # What computes the right sides that are written ``fmu(...)``
 

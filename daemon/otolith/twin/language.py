@@ -19,6 +19,7 @@ from otolith.twin.definition import (
     Definition,
     Figure,
     Input,
+    OperatingRange,
     Output,
     Parameter,
     Role,
@@ -146,6 +147,13 @@ class OwnFigureTable(StrictModel):
     required: Number | None = None
 
 
+class OperationTable(StrictModel):
+    """Where the equations hold, by a signal, in a twin or in a machine file."""
+
+    above: Number | None = None
+    below: Number | None = None
+
+
 class _TwinFile(StrictModel):
     twin: _HeadTable
     states: dict[str, _StateTable]
@@ -157,6 +165,7 @@ class _TwinFile(StrictModel):
     equations: dict[str, str]
     sites: Annotated[dict[str, _SiteTable], Field(default_factory=dict)]
     performance: Annotated[dict[str, FigureTable], Field(default_factory=dict)]
+    operation: Annotated[dict[str, OperationTable], Field(default_factory=dict)]
 
 
 def read_twin(page: SourceFile) -> Definition:
@@ -169,7 +178,7 @@ def read_twin(page: SourceFile) -> Definition:
         faults.append(f"{page.place(location)}: {message}")
 
     file = validate(data, _TwinFile, page)
-    definition = _Reader(file, fault).definition()
+    definition = with_operation(_Reader(file, fault).definition(), file.operation, fault)
     if not faults:
         checker = _EquationChecker(definition, fault)
         checker.check()
@@ -204,6 +213,28 @@ def with_performance(definition: Definition, tables: Mapping[str, OwnFigureTable
     checker.check()
     checker.check_performance()
     return complete
+
+
+def with_operation(definition: Definition, tables: Mapping[str, OperationTable], fault: Fault) -> Definition:
+    """Return the twin with other ranges of its signals in which the equations hold; reports each fault."""
+    ranges, units = {item.signal: item for item in definition.operation}, definition.units()
+    for name, table in tables.items():
+        at: Location = ("operation", name)
+        if name not in definition.signals:
+            fault(at, f"the twin has no signal {name!r}: {nearest(name, list(definition.signals))}")
+            continue
+        try:
+            low, high = (
+                Quantity(units[name]).convert(own) if isinstance(own, str) else own
+                for own in (table.above, table.below)
+            )
+        except ValueError as error:
+            fault(at, str(error))
+            continue
+        if not low < high or (low, high) == (-math.inf, math.inf):
+            fault(at, f"the equations hold above {low:g} and below {high:g} {units[name]}: state one, or a range")
+        ranges[name] = OperatingRange(name, low, high)
+    return replace(definition, operation=tuple(ranges.values()))
 
 
 def _figure(name: str, table: FigureTable, units: Mapping[str, str], fault: Fault) -> Figure:
