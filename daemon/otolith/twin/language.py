@@ -224,10 +224,8 @@ def with_operation(definition: Definition, tables: Mapping[str, OperationTable],
             fault(at, f"the twin has no signal {name!r}: {nearest(name, list(definition.signals))}")
             continue
         try:
-            low, high = (
-                Quantity(units[name]).convert(own) if isinstance(own, str) else own
-                for own in (table.above, table.below)
-            )
+            low = -math.inf if table.above is None else _in_unit(table.above, units[name])
+            high = math.inf if table.below is None else _in_unit(table.below, units[name])
         except ValueError as error:
             fault(at, str(error))
             continue
@@ -235,6 +233,10 @@ def with_operation(definition: Definition, tables: Mapping[str, OperationTable],
             fault(at, f"the equations hold above {low:g} and below {high:g} {units[name]}: state one, or a range")
         ranges[name] = OperatingRange(name, low, high)
     return replace(definition, operation=tuple(ranges.values()))
+
+
+def _in_unit(written: Number, unit: str) -> float:
+    return Quantity(unit).convert(written) if isinstance(written, str) else float(written)
 
 
 def _figure(name: str, table: FigureTable, units: Mapping[str, str], fault: Fault) -> Figure:
