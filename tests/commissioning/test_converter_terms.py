@@ -42,7 +42,7 @@ def _half_bridges(x: Values) -> tuple[float, float]:
 
 def _rates(x: Values, u: Values, q: Values) -> Values:
     direct, quadrature = _half_bridges(x) if q["dead_time"] else (0.0, 0.0)
-    inductance = q["L_q"] * (1.0 - q["saturation"] * abs(x["i_q"]))
+    inductance = q["L_q"] / (1.0 + q["saturation"] * abs(x["i_q"]))
     speed = q["n_p"] * x["omega"]
     torque = 1.5 * q["n_p"] * x["i_q"] * (q["psi"] + (q["L_d"] - inductance) * x["i_d"])
     return {
@@ -111,7 +111,7 @@ def test_a_healthy_record_shows_what_converter_and_iron_do(saturation: float, de
     slope, voltage = found["s_q"], found["V_dt"]
     assert slope == (0.0, None) if not saturation else slope[1] is not None
     inductance = found["L_q"][0] / (1.0 + slope[0] * CURRENT)
-    assert abs(inductance / (9.5 * (1.0 - saturation * CURRENT)) - 1.0) < 0.01  # the machine has another curve
+    assert abs(inductance / (9.5 / (1.0 + saturation * CURRENT)) - 1.0) < 0.01
     assert voltage == (0.0, None) if not dead_time else abs(voltage[0] / (FUNDAMENTAL * DEAD_TIME) - 1.0) < 0.05
     value, sd = found["R_s"]
     assert sd is not None
