@@ -73,7 +73,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     - **Report** estimates, findings and events.
     """
     used, shortened = last_records(window)
-    part = part_in_operation(state.posterior.problem, used)
+    problem = state.posterior.problem
+    part = part_in_operation(problem, used) if problem.base_model.operation else None
     if part is None:
         state, predicted, checked = _predict_and_check(state, used)
         tested, checked = _fit(state, predicted, checked)
