@@ -26,7 +26,7 @@ SOFT = 0.05  # A: current within which the voltage of a half bridge changes its 
 FUNDAMENTAL = 4.0 / np.pi  # of a square wave, over its height
 CURRENT = 8.0  # A, of the quadrature axis under load
 PHASES = np.array([0.0, 2.0, 4.0]) * np.pi / 3.0
-ROWS = often_rows([(SATURATION, False)], [(SATURATION, False), (SATURATION, True), (0.0, False), (0.0, True)])
+ROWS = often_rows([(SATURATION, False)], [(SATURATION, False), (0.0, True), (0.0, False)])
 COMMISSIONED, SECONDS = 20, 20.0  # windows of the healthy record; s
 
 

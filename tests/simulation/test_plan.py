@@ -58,7 +58,7 @@ def test_the_ends_of_a_band_are_quantiles_of_the_mixture(spread: float) -> None:
     normal = spread * norm.ppf((np.arange(400) + 0.5) / 400)
     sine = spread * np.sin(2.0 * np.pi * (np.arange(400) + 0.5) / 400)
     draws = np.stack([normal, sine])[:, :, None]
-    _, low, high = bands(draws, np.ones(1))
+    _, low, high = bands(draws, np.ones(1), np.ones(draws.shape[1], dtype=np.bool_))
     for row in range(2):
         below, above = (norm.cdf(end[row, 0] - draws[row, :, 0]).mean() for end in (low, high))
         assert below == pytest.approx(0.025, abs=0.002)

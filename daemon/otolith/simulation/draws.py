@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask
 from otolith.estimation.imm_filter import TREND_NOISE, process_model
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import indices
@@ -43,6 +43,16 @@ class ParameterDraws:
     _trend_noise: Array  # (draws, free) process noise of each trend, per s^1.5 in the unit; 0 for what stays constant
     _bounds: tuple[Array, Array]
 
+    @property
+    def _future(self) -> NDArray[np.int64]:
+        """What becomes of the trends (draws,): 0 they end, 1 decay, 2 go on."""
+        return np.tile(np.arange(len(self.values) // 2) % 3, 2)
+
+    @property
+    def lasts(self) -> Mask:
+        """The draws (draws,) whose trends do not end at once: of them is the line, within the band of all."""
+        return self._future > 0
+
     @classmethod
     def of(cls, posterior: Posterior, random: np.random.Generator, pairs: int = PAIRS) -> "ParameterDraws":
         """Draw ``pairs`` from ``posterior``: a mode of the filter by its probability, then values and trends in it.
@@ -67,14 +77,17 @@ class ParameterDraws:
     def advance(self, seconds: float, random: np.random.Generator) -> None:
         """Move all draws by ``seconds``.
 
-        Whether a trend decays as the filter lets it, or goes on, is not known: it goes on in every second pair.
+        The data do not say what becomes of a trend: in equally many draws it ends at once, as a warming or a repair
+        does, decays as the filter lets it, or goes on.
         """
         (_, run), (_, fade) = process_model(seconds)[0]
         root = root_of(process_model(seconds)[1])
         pairs = len(self.values) // 2
         deviates = opposite(random.standard_normal((pairs, self.values.shape[1], 2)) @ root.T)
         noise = self._trend_noise[..., None] * deviates
-        goes_on = np.tile(np.arange(pairs) % 2 == 1, 2)[:, None]
-        moved = self.values + np.where(goes_on, seconds, run) * self._trends + noise[..., 0]
-        self._trends = np.where(goes_on, 1.0, fade) * self._trends + noise[..., 1]
+        future = self._future[:, None]
+        moved = self.values + np.choose(future, (0.0, run, seconds)) * self._trends
+        self._trends = np.choose(future, (0.0, fade, 1.0)) * self._trends
+        continues = future > 0
+        moved, self._trends = moved + continues * noise[..., 0], self._trends + continues * noise[..., 1]
         self.values = np.clip(moved, *self._bounds)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask
 from otolith.estimation.information import QUANTILE
 from otolith_drivers.errors import ConfigurationError, nearest, shown
 
@@ -25,7 +25,7 @@ class Prediction:
         units: of the outputs.
         start: time of the first record, s.
         offsets: (records,) time since the first record, s.
-        values: (records, outputs) median of the draws, each in its unit.
+        values: (records, outputs) median of the draws whose trends do not end at once, each in its unit.
         low: (records, outputs) lower end of the 95 % band, each in its unit.
         high: (records, outputs) upper end of the 95 % band, each in its unit.
         driving: (records, inputs) what drove the twin, each in its unit.
@@ -85,10 +85,11 @@ class Prediction:
         return float(np.mean(within[present])) if present.any() else None
 
 
-def bands(draws: Array, noise: Array) -> tuple[Array, Array, Array]:
+def bands(draws: Array, noise: Array, of_line: Mask) -> tuple[Array, Array, Array]:
     """Return median and ends of the 95 % band (records, outputs) of readings with normal ``noise`` (outputs,).
 
-    ``draws`` (records, draws, outputs) are values without that noise. A reading is distributed as their mixture of
+    ``draws`` (records, draws, outputs) are values without that noise; the median is that of those ``of_line`` (draws,).
+    A reading is distributed as their mixture of
     normal distributions, so the noise needs no draws of its own.
     """
     mean = draws.mean(axis=1)
@@ -102,7 +103,7 @@ def bands(draws: Array, noise: Array) -> tuple[Array, Array, Array]:
         guess = low[rows, output], high[rows, output]
         low[rows, output] = _quantile(chosen, sd, TAIL, guess[0])
         high[rows, output] = _quantile(chosen, sd, 1.0 - TAIL, guess[1])
-    return np.median(draws, axis=1), low, high
+    return np.median(draws[:, of_line], axis=1), low, high
 
 
 def _quantile(draws: Array, sd: float, probability: float, guess: Array) -> Array:

@@ -149,14 +149,14 @@ def _prediction(parts: Sequence[_Simulation], window: Window, seed: int) -> Pred
     problem = parts[0].problem
     twin, steps = problem.base_model, problem.steps or (0.0,) * len(problem.base_model.outputs)
     noise = np.sqrt(np.array(problem.noise) ** 2 + np.array(steps) ** 2 / 12.0)
-    known, waiting = [], []
+    known, waiting, of_line = [], [], np.concatenate([part.parameters.lasts for part in parts])
     for outputs in zip(*(part.outputs() for part in parts), strict=False):  # until the first one ends
         waiting.append(np.concatenate(outputs))
         if len(waiting) == CHUNK:
-            known.append(bands(np.array(waiting), noise))
+            known.append(bands(np.array(waiting), noise, of_line))
             waiting = []
     if waiting:
-        known.append(bands(np.array(waiting), noise))
+        known.append(bands(np.array(waiting), noise, of_line))
     if not known:
         raise ValueError("the twin diverges at once")
     middle, low, high = (np.concatenate(column) for column in zip(*known, strict=True))
