@@ -67,14 +67,18 @@ def command(kind: CommandKind = CommandKind.ACKNOWLEDGE, event: EventDocument = 
 class Desk:
     """The desk of a machine, and its decisions."""
 
-    def __init__(self, folder: Path, keys: Path) -> None:
-        self.file, self.keys, self.now = DecisionsFile(folder, SITE, MACHINE), keys, time.time()
-        self.desk = CommandDesk(SITE, MACHINE, self.file, lambda: self.now, lambda: self.now)
+    def __init__(self, folder: Path, keys: Path, ahead: float = 0.0) -> None:
+        """``ahead`` is by how much the wall clock is wrong, s; it may be set later."""
+        self.file, self.keys, self.now, self.ahead = DecisionsFile(folder, SITE, MACHINE), keys, time.time(), ahead
+        self.desk = CommandDesk(SITE, MACHINE, self.file, self.wall, lambda: self.now)
         self.now += 1.0
+
+    def wall(self) -> float:
+        return self.now + self.ahead
 
     def does(self, given: CommandDocument, sender: str = "site") -> bool:
         """Whether a command was new."""
-        return self.takes(signed(given.model_copy(update={"at": self.now}), identity(self.keys, sender)))
+        return self.takes(signed(given.model_copy(update={"at": self.wall()}), identity(self.keys, sender)))
 
     def takes(self, content: bytes) -> bool:
         return bool(json.loads(self.desk.take(content, self.keys / "ca.crt", ("site",), LATEST))["is_new"])
@@ -174,17 +178,30 @@ def test_a_command_that_is_sent_again_later_is_never_carried_out_again(desk: Des
     first = command(at=desk.now)
     content = signed(first, identity(desk.keys))
     assert desk.takes(content)
-    again = CommandDesk(SITE, MACHINE, desk.file, lambda: desk.now)
+    again = CommandDesk(SITE, MACHINE, desk.file, desk.wall, lambda: desk.now)
     with raises_saying(CommandRefusedError, "before the daemon started"):
         again.take(content, desk.keys / "ca.crt", ("site",), LATEST)
     for _ in range(MAX_IDS):
         desk.now += 4.0
         desk.file.write(OperatorDecisions())
         desk.desk._remember(command(at=desk.now))
-    desk.now = first.at
+    desk.ahead = first.at - desk.now
     with raises_saying(CommandRefusedError, "before the daemon started"):
         desk.takes(content)
     assert not desk.decisions.notes
+
+
+@pytest.mark.parametrize("ahead", [-36_000.0, 36_000.0], ids=["behind", "ahead"])
+def test_a_clock_that_is_corrected_after_the_start_admits_nothing_old_and_shuts_nobody_out(
+    tmp_path: Path, keys: Path, ahead: float
+) -> None:
+    desk = Desk(tmp_path / "state", keys, ahead)
+    recorded = signed(command(at=desk.now - 5.0), identity(keys))
+    desk.ahead = 0.0
+    with raises_saying(CommandRefusedError, "before the daemon started"):
+        desk.takes(recorded)
+    assert desk.decisions == OperatorDecisions()
+    assert desk.does(command())
 
 
 def test_more_commands_than_persons_give_are_refused_for_a_while(desk: Desk) -> None:

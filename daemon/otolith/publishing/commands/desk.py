@@ -47,7 +47,8 @@ class CommandDesk:
         self._site, self._machine, self._file, self._wall, self._clock = site, machine, file, wall, clock
         self._lock = threading.Lock()  # the threads of two sessions may ask
         self._known: dict[str, float] = {}  # Time of each command that was carried out, by its id
-        self._floor = wall()  # Commands of this time or before are refused: their ids may be forgotten
+        self._begun = clock()  # Commands before then are refused, whatever the wall clock said then
+        self._forgotten = -math.inf  # Unix time; commands of then or before are refused: their ids may be forgotten
         self._done: deque[float] = deque(maxlen=MAX_COMMANDS)
         self._told = -math.inf
 
@@ -73,6 +74,7 @@ class CommandDesk:
                 raise
 
     def _taken(self, content: bytes, ca: Path, senders: Collection[str], latest: str | None) -> str:
+        elapsed = self._clock() - self._begun  # before the wall clock is read, so that the start is never too early
         now = self._wall()
         command, sender = verified(content, authorities(ca, ()), datetime.fromtimestamp(now, UTC))
         if sender not in senders:
@@ -81,7 +83,7 @@ class CommandDesk:
             raise CommandRefusedError("it is for another machine")
         if command.id in self._known:
             return CommandAnswerDocument(id=command.id, is_new=False).json_line()
-        self._check_time(command, now)
+        self._check_time(command, now, now - elapsed)
         if len(self._done) == MAX_COMMANDS and self._clock() - self._done[0] < COMMAND_SPAN:
             raise CommandRefusedError(f"more than {MAX_COMMANDS} commands in {COMMAND_SPAN:.0f} s: try it again later")
         by = SURROGATE.sub("\ufffd", f"{command.by} ({sender[:MAX_SENDER]})")
@@ -91,19 +93,22 @@ class CommandDesk:
         log.info("command of %s: %s %s", by, command.kind, command.event)
         return CommandAnswerDocument(id=command.id, is_new=True).json_line()
 
-    def _check_time(self, command: CommandDocument, now: float) -> None:
-        """Refuse a command whose id may have been forgotten, and one that is older than a person waits."""
+    def _check_time(self, command: CommandDocument, now: float, begin: float) -> None:
+        """Refuse a command whose id may have been forgotten, and one that is older than a person waits.
+
+        ``begin`` is when this desk began, by the wall clock as it is ``now``: it may have been set since.
+        """
         if abs(age := now - command.at) > MAX_COMMAND_AGE:
             when = f"{age:.0f} s ago" if age > 0.0 else f"{-age:.0f} s in the future"
             remedy = "give it again, and check the clocks of both computers"
             raise CommandRefusedError(f"it was given {when}, which is more than {MAX_COMMAND_AGE:.0f} s: {remedy}")
-        if command.at <= self._floor:
+        if command.at <= max(self._forgotten, begin):
             raise CommandRefusedError("it was given before the daemon started: give it again")
 
     def _remember(self, command: CommandDocument) -> None:
         self._known[command.id] = command.at
         while len(self._known) > MAX_IDS:
-            self._floor = max(self._floor, self._known.pop(next(iter(self._known))))
+            self._forgotten = max(self._forgotten, self._known.pop(next(iter(self._known))))
 
     def _carry_out(self, command: CommandDocument, by: str, latest: str | None) -> None:
         """Write what a command decides, with a note on its event."""
