@@ -114,6 +114,21 @@ def test_a_component_is_decided_about_and_its_event_says_by_whom(desk: Desk, kin
     assert COMPONENT.id in note.text
 
 
+@pytest.mark.parametrize("second", [CommandKind.APPROVE, CommandKind.REJECT])
+def test_the_first_decision_about_a_component_holds(desk: Desk, second: CommandKind) -> None:
+    """Also if the daemon has not obeyed it yet: its report still has the component without a decision."""
+    first = command(CommandKind.APPROVE, SINE)
+    desk.does(first)
+    decided = desk.decisions
+    with raises_saying(CommandRefusedError, COMPONENT.id, "decided"):
+        desk.does(command(second, SINE))
+    assert not desk.does(first)  # a double click is no second decision
+    assert desk.decisions == decided
+    desk.file.write(OperatorDecisions(rejected=frozenset({COMPONENT.id})))  # by the command line
+    with raises_saying(CommandRefusedError, COMPONENT.id, "decided"):
+        desk.does(command(second, SINE))
+
+
 Refused = Callable[[Desk], object]
 REFUSED: dict[str, tuple[Refused, str]] = {
     "of a machine": (lambda desk: desk.does(command(), "press-4"), "may not send"),

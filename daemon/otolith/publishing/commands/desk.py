@@ -139,9 +139,10 @@ def component_of(report: ReportDocument, event: EventDocument) -> ComponentDocum
 
 def _decision(kind: CommandKind, component: str) -> Decide:
     def decided(decisions: OperatorDecisions) -> OperatorDecisions:
-        rest = decisions.without(component)
+        if component in decisions.approved | decisions.rejected:  # and the daemon has not reported that yet
+            raise CommandRefusedError(f"somebody has decided about {component!r} already: look at the page again")
         if kind is CommandKind.APPROVE:
-            return replace(rest, approved=rest.approved | {component})
-        return replace(rest, rejected=rest.rejected | {component})
+            return replace(decisions, approved=decisions.approved | {component})
+        return replace(decisions, rejected=decisions.rejected | {component})
 
     return decided
