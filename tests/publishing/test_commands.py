@@ -18,7 +18,7 @@ from otolith.discovery.decision import Approval
 from otolith.health.schema import ComponentDocument, ComponentStatus, EventDocument, NumberDocument
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import Identity, make_authority, make_certificate, utc_now
-from otolith.publishing.commands.desk import MAX_COMMAND_AGE, MAX_COMMANDS, MAX_IDS, CommandDesk
+from otolith.publishing.commands.desk import MAX_COMMAND_AGE, MAX_COMMANDS, MAX_IDS, REFUSAL_PAUSE, CommandDesk
 from otolith.publishing.commands.documents import MAX_COMMAND_BYTES, CommandDocument, CommandKind
 from otolith.publishing.commands.signatures import CommandRefusedError, signed
 from otolith.publishing.publisher import Published, Publisher
@@ -233,6 +233,21 @@ def test_refusals_fill_no_log(desk: Desk, caplog: pytest.LogCaptureFixture) -> N
         with pytest.raises(CommandRefusedError):
             desk.takes(b"")
     assert len(caplog.records) == 1
+
+
+def test_commands_that_cannot_be_carried_out_fill_no_log_and_refusals_hide_none(
+    desk: Desk, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(CommandRefusedError):
+        desk.takes(b"")
+    for _ in range(50):
+        with raises_saying(CommandRefusedError, "log"):
+            desk.desk.take(b"", desk.keys / "missing.crt", ("site",), LATEST)
+    assert ["missing.crt" in each.getMessage() for each in caplog.records] == [False, True]
+    desk.now += REFUSAL_PAUSE
+    with pytest.raises(CommandRefusedError):
+        desk.desk.take(b"", desk.keys / "missing.crt", ("site",), LATEST)
+    assert len(caplog.records) == 3
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ MAX_COMMANDS = 20  # that are carried out in ...
 COMMAND_SPAN = 60.0  # ... s
 MAX_IDS = 1000  # of commands that are remembered
 MAX_SENDER = 32  # characters of the name in a certificate that a note has
-REFUSAL_PAUSE = 60.0  # s between two lines in the log about refused commands
+REFUSAL_PAUSE = 60.0  # s between two lines in the log about refused commands, and about those that failed
 DONE = {CommandKind.APPROVE: "approved as healthy", CommandKind.REJECT: "rejected"}
 
 
@@ -50,7 +50,7 @@ class CommandDesk:
         self._begun = clock()  # Commands before then are refused, whatever the wall clock said then
         self._forgotten = -math.inf  # Unix time; commands of then or before are refused: their ids may be forgotten
         self._done: deque[float] = deque(maxlen=MAX_COMMANDS)
-        self._told = -math.inf
+        self._told: dict[type[Exception], float] = {}  # When the log had the latest line, by what became of a command
 
     def take(self, content: bytes, ca: Path, senders: Collection[str], latest: str | None) -> str:
         """Carry out a signed command, and return the answer as JSON.
@@ -65,13 +65,17 @@ class CommandDesk:
             try:
                 return self._taken(content, ca, senders, latest)
             except OtolithError as error:
-                log.warning("a command is not carried out: %s", error)
+                self._tell(OtolithError, f"a command is not carried out: {error}")
                 raise CommandRefusedError("the daemon cannot write it: its log has the reason") from error
             except CommandRefusedError as error:
-                if (now := self._clock()) - self._told >= REFUSAL_PAUSE:
-                    self._told = now
-                    log.warning("a command is refused: %s", error)
+                self._tell(CommandRefusedError, f"a command is refused: {error}")
                 raise
+
+    def _tell(self, kind: type[Exception], text: str) -> None:
+        """Log why a command was not obeyed: any reader can send what is refused, and must not fill the log."""
+        if (now := self._clock()) - self._told.get(kind, -math.inf) >= REFUSAL_PAUSE:
+            self._told[kind] = now
+            log.warning("%s", text)
 
     def _taken(self, content: bytes, ca: Path, senders: Collection[str], latest: str | None) -> str:
         elapsed = self._clock() - self._begun  # before the wall clock is read, so that the start is never too early
