@@ -3,6 +3,7 @@
 import base64
 import json
 import logging
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from otolith.adaptation.state import OperatorDecisions
 from otolith.discovery.decision import Approval
 from otolith.health.schema import ComponentDocument, ComponentStatus, EventDocument, NumberDocument
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
+from otolith.publishing import publisher, zenoh_session
 from otolith.publishing.certificates import Identity, make_authority, make_certificate, utc_now
 from otolith.publishing.commands.desk import MAX_COMMAND_AGE, MAX_COMMANDS, MAX_IDS, REFUSAL_PAUSE, CommandDesk
 from otolith.publishing.commands.documents import MAX_COMMAND_BYTES, CommandDocument, CommandKind
@@ -30,7 +32,7 @@ from otolith_drivers.errors import ConfigurationError
 from tests.messages import raises_saying
 from tests.sites.machines import own_endpoint, raised, report_of
 from tests.storage.histories import MACHINE, SITE
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE, wait_for
 
 LIMIT = raised()
 SINE = LIMIT.model_copy(update={"id": "component/shaft/periodic@1700000000.0"})
@@ -259,13 +261,13 @@ def daemon(tmp_path: Path, keys: Path) -> Iterator[Callable[..., tuple[ReaderSes
         endpoint, file = own_endpoint(), DecisionsFile(tmp_path / "state", SITE, MACHINE)
         tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press-3.crt"), key=Path("press-3.key"))
         access = Access(ZenohTable(tls=tls, access=AccessTable(**rules)), keys / "machine.toml")
-        publisher = Publisher([Published(SITE, MACHINE, None, file)], [endpoint], access)
+        published = Publisher([Published(SITE, MACHINE, None, file)], [endpoint], access)
         reader = ReaderSessions(Connection((endpoint,)), (REPORT,), lambda _: None)
-        opened.enter_context(closing(publisher))
+        opened.enter_context(closing(published))
         opened.enter_context(closing(reader))
         reader.start()
         wait_for(lambda: bool(reader.where(f"otolith/{SITE}/{MACHINE}")))
-        publisher.publish(REPORTED)
+        published.publish(REPORTED)
         return reader, file
 
     with opened:
@@ -285,6 +287,39 @@ def test_a_command_comes_over_zenoh_and_its_refusal_is_told(
         reader.command(key, signed(command(), identity(keys, "press-4")))
     with raises_saying(NotCarriedOutError, "no signed command"):
         reader.command(key, base64.b64encode(b"x"))
+
+
+def test_readers_of_the_history_delay_no_command(
+    daemon: Callable[..., tuple[ReaderSessions, DecisionsFile]], keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever may read may ask for as much of the history as it has, in a loop."""
+    asked, released = threading.Event(), threading.Event()
+
+    def answered(*_: object, **__: object) -> None:
+        asked.set()
+        released.wait(PATIENCE)
+
+    monkeypatch.setattr(publisher, "answer", answered)
+    reader, _ = daemon(commands=("site",))
+    asking = threading.Thread(target=reader.get, args=(f"{REPORT.under(SITE, MACHINE)}?last=1000",))
+    asking.start()
+    try:
+        assert asked.wait(PATIENCE)
+        given = command()
+        assert json.loads(reader.command(COMMAND.under(SITE, MACHINE), signed(given, identity(keys))))["is_new"]
+    finally:
+        released.set()
+        asking.join()
+
+
+def test_who_sends_one_command_too_many_is_told_so(
+    daemon: Callable[..., tuple[ReaderSessions, DecisionsFile]], keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_session, "MAX_WAIT", -1.0)  # all have waited for too long
+    reader, file = daemon(commands=("site",))
+    with raises_saying(NotCarriedOutError, "commands", "again"):
+        reader.command(COMMAND.under(SITE, MACHINE), signed(command(), identity(keys)))
+    assert not file.path.exists()
 
 
 def test_by_default_nothing_takes_commands(

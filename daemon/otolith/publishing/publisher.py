@@ -139,6 +139,8 @@ class Publisher:
         self._unusable: tuple[object, ...] = ()  # Stamps of the files at the latest look that could not use them
         self._sessions: tuple[_Session, ...] = ()
         self._answers, self._latest = QueryAnswers(), QueryAnswers("answer-latest", share=1.0)
+        # Apart from queries, so that no reader of the history shuts out who may send commands
+        self._commands = QueryAnswers("answer-commands", what="commands", remedy="give it again later")
         self._waiting: dict[_Endpoints, str] = {}  # And why they could not be opened
         self._thread = threading.Thread(target=self._keep_open, name="open-endpoints", daemon=True)
         everything = _Endpoints(self._listen, tuple(access.zenoh.connect))
@@ -261,12 +263,15 @@ class Publisher:
         self._closing.set()
         self._wake.set()
         self._thread.join(CLOSE_WAIT)
-        self._answers.close()
-        self._latest.close()
+        answering = self._commands, self._answers, self._latest
+        for each in answering:  # all together, so that the daemon ends in time
+            each.stop()
+        for each in answering:
+            each.close()
         with self._lock:
             sessions, self._sessions = self._sessions, ()
-        for each in sessions:
-            close_session(each.opened)
+        for own in sessions:
+            close_session(own.opened)
 
     def _put(self, key: str, text: str) -> None:
         """Put a document on each session; the caller has the lock, so that no session is closed meanwhile."""
@@ -433,7 +438,7 @@ class Publisher:
             except CommandRefusedError as error:
                 query.reply_err(str(error))
 
-        return (_queryable(opened, key, lambda query: self._answers.add(query, obey)),)
+        return (_queryable(opened, key, lambda query: self._commands.add(query, obey)),)
 
 
 def _queryable(opened: zenoh.Session, key: str, take: Callable[[zenoh.Query], None]) -> Declared:

@@ -148,14 +148,20 @@ def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive:
 
 
 class QueryAnswers:
-    """Answers queries: one at a time, and those of the history for a share of the time, so that they delay no report.
+    """Answers queries: one at a time, and for a share of the time, so that they delay no report.
 
     No query is answered in the thread in which Zenoh receives it: an answer may wait for who asks.
     """
 
-    def __init__(self, name: str = "answer-queries", share: float = SHARE) -> None:
-        """``name`` is that of its thread, and ``share`` that of a core which it may take for long."""
-        self._share = share
+    def __init__(
+        self, name: str = "answer-queries", share: float = SHARE, what: str = "queries",
+        remedy: str = "ask again later, and for more documents at a time",
+    ) -> None:  # fmt: skip
+        """``name`` is that of its thread, and ``share`` that of a core which it may take for long.
+
+        Who sends too many of ``what`` is told the ``remedy``.
+        """
+        self._share, self._what, self._remedy = share, what, remedy
         self._waiting: queue.Queue[tuple[float, zenoh.Query, Callable[[zenoh.Query], None]]] = queue.Queue(MAX_QUERIES)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -170,9 +176,13 @@ class QueryAnswers:
         except queue.Full:
             self._refuse(asked)
 
+    def stop(self) -> None:
+        """Begin no further answer."""
+        self._stopping.set()
+
     def close(self) -> None:
         """Answer no more."""
-        self._stopping.set()
+        self.stop()
         self._thread.join(JOIN)
 
     def _run(self) -> None:
@@ -200,10 +210,10 @@ class QueryAnswers:
     def _refuse(self, asked: zenoh.Query) -> None:
         self.refused += 1
         with asked:
-            asked.reply_err("too many queries: ask again later, and for more documents at a time")
+            asked.reply_err(f"too many {self._what}: {self._remedy}")
         if (now := time.monotonic()) - self._told >= LOG_PAUSE:
             self._told = now
-            log.warning("queries come too fast: %d were refused since the start", self.refused)
+            log.warning("%s come too fast: %d were refused since the start", self._what, self.refused)
 
 
 @dataclass(frozen=True, slots=True)
