@@ -245,12 +245,13 @@ TWO_MASS = Plant(
 
 
 def _pmsm_rates(x: Values, u: Values, q: Values) -> Values:
-    speed, inductance = q["n_p"] * x["omega"], q["L_q"] / (1.0 + q["s_q"] * np.abs(x["i_q"]))
-    lost = q["V_dt"] / np.sqrt(x["i_d"] ** 2 + x["i_q"] ** 2 + q["i_s"] ** 2)
+    speed, saturation = q["n_p"] * x["omega"], 1.0 + q["s_q"] * np.abs(x["i_q"])
+    inductance, slope = q["L_q"] / saturation, q["L_q"] / saturation**2  # of the flux by the current
+    lost = q["V_dt"] / np.sqrt(x["i_d"] ** 2 + x["i_q"] ** 2 + 0.25)
     torque = 1.5 * q["n_p"] * x["i_q"] * (q["psi"] + (q["L_d"] - inductance) * x["i_d"]) * (1.0 + q["torque"])
     return {
         "i_d": (u["v_d"] - (q["R_s"] + lost) * x["i_d"] + speed * inductance * x["i_q"]) / q["L_d"],
-        "i_q": (u["v_q"] - (q["R_s"] + lost) * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / inductance,
+        "i_q": (u["v_q"] - (q["R_s"] + lost) * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / slope,
         "omega": (torque - u["T_load"] - q["D"] * x["omega"] + q["shaft"]) / q["J"],
     }
 
@@ -275,7 +276,6 @@ PMSM = Plant(
         "psi": 0.175,
         "s_q": 0.0,
         "V_dt": 0.0,
-        "i_s": 0.5,
         "n_p": 4.0,
         "J": 0.008,
         "D": 0.002,

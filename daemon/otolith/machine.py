@@ -201,6 +201,8 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     if file.performance:
         complete = with_performance(complete, file.performance, lambda at, text: context.fail((*at,), text))
     unmeasured = _unmeasured(file, complete, source)
+    for name in (item.name for item in unmeasured if item.name in file.operation):
+        context.fail(("operation", name), "no sensor measures it: give a range of a signal that is measured")
     twin = _without_sensors(file, complete, unmeasured, context)
     signals = {
         name: validate(_common(table), SignalTable, source, under=("signals", name))

@@ -25,6 +25,8 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.operating_states import MIN_OFF, off_records, part_in_operation, running_part
 from otolith.adaptation.state import initial_state
+from otolith.discovery.alternatives import WindowDecision
+from otolith.estimation.problem import MIN_OUTSIDE
 from otolith.health.schema import Status
 from otolith.machine import LoadedMachine
 from tests.variants import often
@@ -146,16 +148,48 @@ def test_a_pump_that_rests_behind_its_check_valve_is_no_event(seed: int) -> None
             covered.append(item.low <= 11.5 <= item.high)
         reasons.add(item.reason)
     assert sum(covered) >= 0.9 * len(covered) > 10
-    assert any("Q was below 1 m³/h" in reason for reason in reasons)
+    assert any("omega was below 90 rad/s" in reason for reason in reasons)
 
 
 def test_a_wrong_reading_is_no_stop() -> None:
     machine, windows = _pump_that_rests(1, 10.0)
     values = windows[1].values.copy()
-    values[100 : 100 + MIN_OFF - 1, machine.twin.signals.index("Q")] = 0.0
+    values[100 : 100 + MIN_OUTSIDE - 1, machine.twin.signals.index("omega")] = 0.0
     assert part_in_operation(machine.problem, replace(windows[1], values=values)) is None
-    values[100 : 100 + MIN_OFF, machine.twin.signals.index("Q")] = 0.0
+    values[100 : 100 + MIN_OUTSIDE, machine.twin.signals.index("omega")] = 0.0
     part = part_in_operation(machine.problem, replace(windows[1], values=values))
     assert part is not None
     assert part.window is not None
-    assert part.window.records == len(values) - 100 - MIN_OFF
+    assert part.window.records == len(values) - 100 - MIN_OUTSIDE
+
+
+def test_readings_are_counted_not_records() -> None:
+    """Of a signal that is measured every tenth record: the records before its first reading are as that reading."""
+    machine, windows = _pump_that_rests(1, 10.0)
+    column, values = machine.twin.signals.index("omega"), windows[1].values.copy()
+    missing = windows[1].missing.copy()
+    missing[:, column] = np.arange(len(values)) % 10 != 7
+    rare = replace(windows[1], missing=missing)
+    values[107, column] = 0.0
+    assert part_in_operation(machine.problem, replace(rare, values=values)) is None
+    values[:48, column] = 0.0
+    values[0, column] = 1e9  # without meaning, as it was not measured
+    part = part_in_operation(machine.problem, replace(rare, values=values))
+    assert part is not None
+    assert part.note.startswith("omega was below 90 rad/s")
+    assert part.window is not None
+    assert part.window.records == len(values) - 57
+
+
+def test_a_flow_sensor_that_fails_at_full_speed_is_no_rest() -> None:
+    machine, windows = _pump_that_rests(1, 35.0)
+    column = machine.twin.signals.index("Q")
+    state = initial_state("m", "s", machine.problem, machine.plan)
+    for window in windows[:3]:
+        state, _ = adapt(state, window)
+    for window in windows[3:]:
+        values = window.values.copy()
+        values[:, column] = 0.05 * np.random.default_rng(window.index).standard_normal(len(values))
+        state, report = adapt(state, replace(window, values=values))
+        assert report.document.decision is not WindowDecision.OFF
+        assert report.document.findings

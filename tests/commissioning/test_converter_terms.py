@@ -42,12 +42,13 @@ def _half_bridges(x: Values) -> tuple[float, float]:
 
 def _rates(x: Values, u: Values, q: Values) -> Values:
     direct, quadrature = _half_bridges(x) if q["dead_time"] else (0.0, 0.0)
-    inductance = q["L_q"] / (1.0 + q["saturation"] * abs(x["i_q"]))
+    linkage = q["L_q"] * x["i_q"] / (1.0 + q["saturation"] * abs(x["i_q"]))
+    slope = q["L_q"] / (1.0 + q["saturation"] * abs(x["i_q"])) ** 2  # of the linkage by the current
     speed = q["n_p"] * x["omega"]
-    torque = 1.5 * q["n_p"] * x["i_q"] * (q["psi"] + (q["L_d"] - inductance) * x["i_d"])
+    torque = 1.5 * q["n_p"] * ((q["psi"] + q["L_d"] * x["i_d"]) * x["i_q"] - linkage * x["i_d"])
     return {
-        "i_d": (u["v_d"] - direct - q["R_s"] * x["i_d"] + speed * inductance * x["i_q"]) / q["L_d"],
-        "i_q": (u["v_q"] - quadrature - q["R_s"] * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / inductance,
+        "i_d": (u["v_d"] - direct - q["R_s"] * x["i_d"] + speed * linkage) / q["L_d"],
+        "i_q": (u["v_q"] - quadrature - q["R_s"] * x["i_q"] - speed * (q["L_d"] * x["i_d"] + q["psi"])) / slope,
         "omega": (torque - u["T_load"] - q["D"] * x["omega"]) / q["J"],
         "angle": speed,
     }

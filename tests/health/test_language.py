@@ -127,6 +127,17 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
             "write at most 2 s as length under [window], or a longer sample_period",
             "unter [window] als length höchstens 2 s eintragen, oder eine längere sample_period",
         ),
+        (
+            "nothing is estimated from this window: Q was below 1 m³/h for 5 s, in which no equation of the twin holds",
+            (
+                "aus dem Zeitfenster wird nichts geschätzt: Q lag unter 1 m³/h, 5 s lang; "
+                "so lange gilt keine Gleichung des Zwillings"
+            ),
+        ),
+        (
+            "the drive was switched off for 3 s, in which no equation of the twin holds",
+            "der Antrieb war abgeschaltet, 3 s lang; so lange gilt keine Gleichung des Zwillings",
+        ),
         ("5% of i is missing, more than missing_limit (1%)", "5% von i fehlen, mehr als missing_limit (1%)"),
         ("shaft: -0.004·sin(angle(omega)) N*m", "shaft: -0.004·sin(angle(omega)) N*m"),
         ("a sentence with {braces} of somebody", "a sentence with {braces} of somebody"),

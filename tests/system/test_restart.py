@@ -189,21 +189,22 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     state = service.machine.state
     before = state.previous["R_a"]
     refuted = type(before)(known=True, status=Status.INVALID)
-    state.previous["R_a"] = refuted
+    service.machine.state = replace(state, previous={**state.previous, "R_a": refuted})
     service._save(1e6)
     assert requested == []
-    state.previous["R_a"] = before
+    service.machine.state = state
+    valid = service.machine.packed
     service._save(1e6)
     service._save(1e6 + 59.0)
-    assert requested == [state]
+    assert requested == [valid]
     service._save(1e6 + 61.0)
-    assert requested == [state, state]
+    assert requested == [valid, valid]
     service._save(1e6 + 62.0)
     service.machine.state = replace(state, previous={**state.previous, "R_a": refuted})
     service._save(math.inf)  # at the end: the last state that nothing contradicts
-    assert requested == [state, state, state]
+    assert requested == [valid, valid, valid]
     service._save(math.inf)
-    assert requested == [state, state, state]
+    assert requested == [valid, valid, valid]
 
 
 def test_an_event_is_saved_at_once(healthy: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:

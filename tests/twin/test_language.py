@@ -264,8 +264,19 @@ def test_a_machine_file_replaces_the_range_of_a_signal(tmp_path: Path) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(
         f'[machine]\nname = "m"\n[twin]\nfile = "{LIBRARY / "pump"}.toml"\n'
-        '[operation]\nQ = { above = "1 l/s" }\nu = { above = 0.2, below = 0.9 }\n',
+        '[operation]\nomega = { above = "600 rpm" }\nu = { above = 0.2, below = 0.9 }\n',
         encoding="utf-8",
     )
     ranges = {own.signal: (own.low, own.high) for own in load_machine(path, with_driver=False).twin.operation}
-    assert ranges == {"Q": (pytest.approx(3.6), np.inf), "omega": (10.0, np.inf), "u": (0.2, 0.9)}
+    assert ranges == {"omega": (pytest.approx(20.0 * np.pi), np.inf), "u": (0.2, 0.9)}
+
+
+def test_a_range_of_what_no_sensor_measures_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(
+        '[machine]\nname = "m"\n[twin]\nname = "dc_motor"\n[signals]\nT_load = { unknown = "constant" }\n'
+        "[operation]\nT_load = { above = 0 }\n",
+        encoding="utf-8",
+    )
+    with raises_saying(ConfigurationError, str(path), "operation.T_load", "no sensor"):
+        load_machine(path, with_driver=False)

@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.machine import find_twin, library_twins
-from otolith.twin.definition import Definition, Role
+from otolith.twin.definition import Definition, OperatingRange, Role
 from otolith.twin.identifiability import structural_identifiability
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from tests.twin.reference import Reference
@@ -160,3 +160,10 @@ def test_a_constant_load_and_damping_need_a_change_of_speed() -> None:
     assert constant["D"] == "only together with T_load"
     assert constant["T_load"] == "only together with D"
     assert constant["R_a"] == ""
+
+
+def test_a_range_of_an_input_without_a_sensor_is_dropped() -> None:
+    """Its twin cannot be asked where the input is; another range stays."""
+    ranges = (OperatingRange("T_load", low=0.0), OperatingRange("omega", low=1.0))
+    twin = replace(find_twin("dc_motor"), operation=ranges)
+    assert without_sensor(twin, UnmeasuredInput("T_load", Assumption.CONSTANT)).operation == ranges[1:]

@@ -13,12 +13,12 @@ import numpy as np
 
 from otolith.acquisition.window import Mask, Window, runs_of
 from otolith.estimation.evidence import SIGNIFICANT_DEVIATE
-from otolith.estimation.problem import Problem, outside_of
+from otolith.estimation.problem import Problem, out_of_operation, runs_outside
 from otolith.twin.definition import Definition
 from otolith.twin.expressions import names_in, parse
 from otolith_drivers.units import are_of_one_quantity, unit_text
 
-MIN_OFF = 5  # records without a command, or outside of a range, from which on the equations do not hold
+MIN_OFF = 5  # records without a command from which on a drive is off
 SWITCHING = 3  # records within which the current of an open bridge ends
 OFF_SHARE = 0.95  # of the records of a stretch whose current is zero within its noise
 MIN_ON_SHARE = 0.25  # of the records of a window: less between two stretches is not estimated from
@@ -34,18 +34,13 @@ class RunningPart:
 
 def part_in_operation(problem: Problem, window: Window) -> RunningPart | None:
     """Return the longest part of ``window`` in which the twin states that its equations hold; None if that is all."""
-    off, reasons = np.zeros(window.records, dtype=np.bool_), list[str]()
-    for own in problem.base_model.operation:
-        runs = [run for run in runs_of(outside_of(own, window)) if run[1] - run[0] >= MIN_OFF]
-        for start, end in runs:  # a shorter one is a wrong reading
-            off[start:end] = True
-        if runs:
-            unit = unit_text(problem.base_model.unit_of(own.signal))
-            is_below = window.readings(own.signal)[runs[0][0]] < own.low
-            reasons.append(
-                f"{own.signal} was {'below' if is_below else 'above'} {own.low if is_below else own.high:g} {unit}"
-            )
-    return _longest_part(window, off, " and ".join(reasons)) if reasons else None
+    twin, reasons = problem.base_model, list[str]()
+    for own in twin.operation:
+        for _, _, reading in runs_outside(own, window)[:1]:
+            unit, is_below = unit_text(twin.unit_of(own.signal)), reading < own.low
+            limit = f"{own.low if is_below else own.high:g} {unit}"
+            reasons.append(f"{own.signal} was below {limit}" if is_below else f"{own.signal} was above {limit}")
+    return _longest_part(window, out_of_operation(twin, window), " and ".join(reasons)) if reasons else None
 
 
 def running_part(problem: Problem, window: Window) -> RunningPart | None:

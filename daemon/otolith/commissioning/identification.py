@@ -64,7 +64,10 @@ NOT_OBSERVABLE = "no output depends on it"
 AT_REST = "nothing moves in these windows, so its process noise cannot be identified"
 NOT_SIGNIFICANT = "not significant: up to about {:.1g} {} per square root of a second cannot be detected"
 NO_WINDOW = "no window can be used: nothing was identified"
-EXCLUDED = "windows excluded because they are badly sampled, too short, or the twin does not explain them: {} of {}"
+EXCLUDED = (
+    "windows excluded because they are badly sampled, too short, out of [operation], or the twin does not explain "
+    "them: {} of {}"
+)
 EXCLUDED_AT_REST = "windows excluded because nothing moves in them: {} of {}"
 EXCLUDED_OUTLYING = (
     "windows excluded because they do not fit all others: {} of {}, from {}: a standstill, a disturbance or a change "

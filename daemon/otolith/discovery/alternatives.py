@@ -38,7 +38,7 @@ class WindowDecision(StrEnum):
     SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
     TIMING = "a signal is late: its delay does not count as a change of a parameter"
     BAD = "the window is not good enough: it does not update the estimates"
-    OFF = "the drive is switched off, so that the equations of the twin do not hold: it does not update the estimates"
+    OFF = "the equations of the twin do not hold in this state of the machine: it does not update the estimates"
     REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
 
     @property

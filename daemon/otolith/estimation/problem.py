@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from otolith.acquisition.samples import Check
-from otolith.acquisition.window import Array, Mask, Window
+from otolith.acquisition.window import Array, Mask, Window, runs_of
 from otolith.estimation.sensor_models import SensorModel
 from otolith.twin.components import (
     MAX_COMPONENTS,
@@ -36,6 +36,7 @@ MIN_CHANGE = 1.2  # ratio below which the window length stays as it is
 SHORTENED = 0.5  # ratio of window lengths after a window that the twin does not explain
 AMPLITUDE_BOUND = 10.0  # times the discovered amplitude
 INNER_BOUND = 3.0  # times the discovered inner parameter, up and down
+MIN_OUTSIDE = 5  # readings of a signal outside of a range in a row, from which on the equations do not hold
 PHASE_BOUND = 4.0 * np.pi  # rad; every window brings the phase back between -pi and pi
 
 
@@ -312,17 +313,26 @@ def equation(twin: Definition, component: Component, values: Sequence[float]) ->
     return text if site.unit == "1" else f"{text} {site.unit}"
 
 
-def outside_of(own: OperatingRange, window: Window) -> Mask:
-    """Return where a signal is outside of a range (records,); it stays where it was until it is measured again."""
-    is_outside = (window.readings(own.signal) < own.low) | (window.readings(own.signal) > own.high)
+def runs_outside(own: OperatingRange, window: Window) -> list[tuple[int, int, float]]:
+    """Return first record, end and first reading of each stretch of a window in which a signal is outside of a range.
+
+    It stays where it was until it is measured again. Fewer readings in a row are wrong ones, unless the window has no
+    others.
+    """
     measured = np.flatnonzero(~window.missing_in(own.signal))
-    if not len(measured):
-        return np.zeros(window.records, dtype=np.bool_)
-    last = np.searchsorted(measured, np.arange(window.records), side="right") - 1
-    return np.asarray(is_outside[measured[np.maximum(last, 0)]], dtype=np.bool_)
+    readings = window.readings(own.signal)[measured]
+    edges = np.concatenate([[0], measured[1:], [window.records]])
+    least = min(MIN_OUTSIDE, len(measured))
+    runs = runs_of((readings < own.low) | (readings > own.high))
+    return [
+        (int(edges[first]), int(edges[last]), float(readings[first])) for first, last in runs if last - first >= least
+    ]
 
 
 def out_of_operation(twin: Definition, window: Window) -> Mask:
     """Return where the equations of a twin need not hold (records,), as it states."""
-    outside = [outside_of(own, window) for own in twin.operation]
-    return np.any(outside, axis=0) if outside else np.zeros(window.records, dtype=np.bool_)
+    outside = np.zeros(window.records, dtype=np.bool_)
+    for own in twin.operation:
+        for first, last, _ in runs_outside(own, window):
+            outside[first:last] = True
+    return outside

@@ -149,7 +149,8 @@ def _of_example(plan: MonitoringPlan, observed: Observation, start: float, past:
 
     What does not fit is then the machine file to complete, and nothing has happened to the machine.
     """
-    examples = [name for name, quantity in plan.known.items() if quantity.is_example]
+    # An example of zero says that the twin's term is absent, as a record that does not show it does.
+    examples = [name for name, quantity in plan.known.items() if quantity.is_example and quantity.nominal]
     begin = start if observed.since is None else observed.since
     is_from_start = past.known_since is None or begin < past.known_since
     is_warning = observed.level in (Level.WATCH, Level.ACT) and observed.features.finding in BY_THE_TWIN

@@ -82,7 +82,11 @@ def without_sensor(definition: Definition, item: UnmeasuredInput) -> Definition:
         raise ValueError(f"the twin has no input {item.name}")
     if not driven.has_range:
         raise ValueError(f"the twin states no range of {driven.name}: write one in its file, like range = [-5, 5]")
-    rest = replace(definition, inputs=tuple(row for row in definition.inputs if row is not driven))
+    rest = replace(
+        definition,
+        inputs=tuple(row for row in definition.inputs if row is not driven),
+        operation=tuple(own for own in definition.operation if own.signal != driven.name),
+    )
     match item.assumption:
         case Assumption.CONSTANT:
             changed = replace(rest, parameters=(*rest.parameters, _constant(driven)))
