@@ -40,7 +40,7 @@ from otolith.machine_file import (
 from otolith.service_file import SERVICE_FILE, with_service_file
 from otolith.twin.components import FAMILY_NAMES, gain_site, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
-from otolith.twin.language import MAX_COEFFICIENT, read_twin, with_operation, with_performance
+from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith.twin.unmeasured import Assumption, UnmeasuredInput, without_sensor
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
@@ -196,10 +196,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     expect(source, data, "machine")
     file, of_service = with_service_file(validate(data, MachineFile, source), path)
     context = Context(source)
-    complete = _twin(file, path, context)
-    complete = with_operation(complete, file.operation, lambda at, text: context.fail((*at,), text))
-    if file.performance:
-        complete = with_performance(complete, file.performance, lambda at, text: context.fail((*at,), text))
+    complete = file.applied_to(_twin(file, path, context), context)
     unmeasured = _unmeasured(file, complete, source)
     for name in (item.name for item in unmeasured if item.name in file.operation):
         context.fail(("operation", name), "no sensor measures it: give a range of a signal that is measured")

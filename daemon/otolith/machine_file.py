@@ -23,7 +23,7 @@ from otolith.health.limits import COLDEST, THERMAL_TIME
 from otolith.health.schema import Language
 from otolith.outlet_tables import OutletsTable
 from otolith.twin.definition import Definition
-from otolith.twin.language import OperationTable, OwnFigureTable
+from otolith.twin.language import OperationTable, OwnFigureTable, with_operation, with_performance
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
 from otolith_drivers.common.guard import GuardedSource
 from otolith_drivers.common.time_zones import check_time_zone
@@ -274,7 +274,21 @@ class EvidenceTable(StrictModel):
     max_megabytes: Annotated[int, Field(ge=0, le=1_000_000)] = 100  # with 0 there are none
 
 
-class MachineFile(StrictModel):
+class OwnTables(StrictModel):
+    """What a machine file states of its twin, beside parameters and signals."""
+
+    performance: Annotated[dict[str, OwnFigureTable], Field(default_factory=dict)]
+    """Figures of performance, and other keys of those of the twin, by name."""
+    operation: Annotated[dict[str, OperationTable], Field(default_factory=dict)]
+    """Ranges of signals in which the equations of the twin hold."""
+
+    def applied_to(self, twin: Definition, context: Context) -> Definition:
+        """Return the twin as this machine has it; raise ConfigurationError at the first fault."""
+        twin = with_operation(twin, self.operation, context.fail)
+        return with_performance(twin, self.performance, context.fail) if self.performance else twin
+
+
+class MachineFile(OwnTables):
     """The whole file."""
 
     machine: MachineTable
@@ -288,10 +302,6 @@ class MachineFile(StrictModel):
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
     components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]  # Limits of amplitudes, by site
-    performance: Annotated[dict[str, OwnFigureTable], Field(default_factory=dict)]
-    """Figures of performance, and other keys of those of the twin, by name."""
-    operation: Annotated[dict[str, OperationTable], Field(default_factory=dict)]
-    """Ranges of signals in which the equations of the twin hold."""
     rule: tuple[OwnRule, ...] = ()  # Of the diagnosis, before the packaged ones
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # Standard deviation of each sensor
     process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # In the state's unit per s^0.5

@@ -146,7 +146,7 @@ class Context:
 
     file: SourceFile
 
-    def fail(self, location: tuple[int | str, ...], message: str) -> None:
+    def fail(self, location: Location, message: str) -> None:
         """Raise ``message`` as an error at ``location``."""
         raise ConfigurationError(f"{self.file.place(location)}: {message}")
 

@@ -64,14 +64,15 @@ def test_a_driver_without_its_extra_says_how_to_install_it(monkeypatch: pytest.M
         otolith("drivers", "opcua")
 
 
-def test_figures_of_performance_are_shown_as_written(tmp_path: Path) -> None:
+def test_what_a_machine_file_states_of_its_twin_is_shown_as_written(tmp_path: Path) -> None:
     row = '{ unit = "W", better = "lower", meaning = "heat", expression = "R_a*i^2", at = { i = 1 } }'
-    own = f"\n[performance]\nP_i = {row}\n"
+    own = f"\n[performance]\nP_i = {row}\n[operation]\nomega = {{ above = 5 }}\n"
     file = tmp_path / "machine.toml"
     text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8").replace('dbc = "', f'dbc = "{EXAMPLES}/')
     file.write_text(text + own, encoding="utf-8")
     whole = tmp_path / "whole.toml"
     whole.write_text(otolith("config", "show", file).output, encoding="utf-8")
-    figures = load_machine(whole).twin.performance
-    assert figures == load_machine(file).twin.performance
-    assert "P_i" in [figure.name for figure in figures]
+    twin = load_machine(whole).twin
+    assert twin == load_machine(file).twin
+    assert "P_i" in [figure.name for figure in twin.performance]
+    assert [own.signal for own in twin.operation] == ["omega"]

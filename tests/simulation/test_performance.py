@@ -17,7 +17,7 @@ from otolith.cli.main import cli
 from otolith.cli.operation.live_table import LiveTable
 from otolith.health.schema import LANGUAGES, LackDocument, Language, ReportDocument, RequirementDocument, Status
 from otolith.health.text import performance_texts, texts_in
-from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine
+from otolith.machine import LIBRARY, LoadedMachine, find_twin, library_twins, load_machine
 from otolith.publishing.html_report import html_report
 from otolith.simulation.performance import Estimates, ReferenceValues, figures_of
 from otolith.storage.history import PERFORMANCE, WINDOW, describe_machine, history_path
@@ -25,6 +25,7 @@ from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.messages import raises_saying
 
 CONFIG = Path(__file__).parents[2] / "config"
 MOTOR = find_twin("dc_motor")
@@ -237,3 +238,33 @@ def test_a_fault_of_a_machine_file_is_named(tmp_path: Path) -> None:
     path.write_text(text + wrong, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="x y"):
         load_machine(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "required"),
+    [
+        ('unit = "kW"', 0.03),
+        ('unit = "kW", required = 2', 2.0),
+        ('unit = "W"', 30.0),
+        ('meaning = "heat"', 30.0),
+        ('unit = "V", expression = "R_a*i", required = 3', 3.0),
+    ],
+)
+def test_what_the_twin_requires_is_the_same_in_another_unit(tmp_path: Path, keys: str, required: float) -> None:
+    heat = load_machine(_with_required(tmp_path, keys), with_driver=False).twin.performance[0]
+    assert heat.required == pytest.approx(required, rel=1e-12)
+
+
+def test_what_the_twin_requires_is_not_taken_for_another_quantity(tmp_path: Path) -> None:
+    path = _with_required(tmp_path, 'unit = "V", expression = "R_a*i"')
+    with raises_saying(ConfigurationError, f"{path}:6", "performance.P_Cu", "30 W", "V", "required"):
+        load_machine(path, with_driver=False)
+
+
+def _with_required(folder: Path, keys: str) -> Path:
+    """A machine file with keys of a figure for which its twin requires 30 W."""
+    text = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
+    (folder / "twin.toml").write_text(text.replace("P_Cu = {", "P_Cu = { required = 30,"), encoding="utf-8")
+    own = f'[machine]\nname = "m"\n[twin]\nfile = "twin.toml"\n[performance]\nP_Cu = {{ {keys} }}\n'
+    (folder / "machine.toml").write_text(own, encoding="utf-8")
+    return folder / "machine.toml"

@@ -182,6 +182,28 @@ def test_a_bundle_knows_which_inputs_have_no_sensor(batch: list[Window], folder:
     assert again.document.parameters == report.document.parameters
 
 
+def test_a_twin_that_the_machine_file_changes_is_reproduced(batch: list[Window], folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "machine.toml"
+    tables = '[performance]\nomega_max = { required = "40 rad/s" }\n[operation]\nomega = { above = "1 rad/s" }\n'
+    tables += "[discovery]\nenabled = false\n"
+    path.write_text(f"{FILE.path.read_text(encoding='utf-8')}\n{tables}", encoding="utf-8")
+    machine = load_machine(path, with_driver=False)
+    kept, before = EvidenceWriter(machine), initial_state("dc-motor", "demo", machine.problem, machine.plan)
+    kept.folder = folder
+    for window in batch:
+        after, report = adapt(before, window)
+        add(kept, before, window, report, after)
+        before = after
+        if kept._waiting:
+            break
+    assert [figure.name for figure in machine.twin.performance if figure.required] == ["omega_max"]
+    kept.write()
+    (bundle,) = folder.glob("*.zip")
+    assert read_bundle(bundle).state.posterior.problem.twin == machine.twin
+    result = reproduce(bundle)
+    assert (result.return_value, "the same to the last bit" in result.stdout) == (0, True), result.output
+
+
 def test_the_bits_and_the_order_of_numbers_are_kept() -> None:
     values = np.asfortranarray([[0.1, -0.0, np.nan], [np.inf, -np.inf, 5e-324]])
     window = Window.whole(0, -0.0, PERIOD, ("a", "b", "c"), values)

@@ -1,6 +1,6 @@
 """Evidence of events: bundles with all that is needed to compute the reports around an event again, bit for bit.
 
-A bundle is a ZIP archive with a :class:`Bundle` as JSON, the twin, and for people the machine file without secrets.
+A bundle is a ZIP archive with a :class:`Bundle` as JSON, the twin, and the machine file without secrets.
 The JSON is that of :mod:`otolith.storage.exact_json`: the same to the last bit, and without a twin.
 Learned states (``learned_state.py``) are written by other means: they must survive a new version, and be plausible.
 
@@ -30,12 +30,13 @@ from otolith.health.events import OF_DATA
 from otolith.health.schema import EventChange, EventDocument, Report
 from otolith.health.text import announcements
 from otolith.machine import FINGERPRINT_KEYS, LIBRARY, LoadedMachine
+from otolith.machine_file import OwnTables
 from otolith.storage.disk import WRITE_RETRY, WriterThread, reason_of, replace_file
 from otolith.storage.exact_json import Decoder, encoded
 from otolith.storage.recording_files import STAMP
 from otolith.twin.language import read_twin
 from otolith.twin.unmeasured import UnmeasuredInput, without_sensor
-from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
+from otolith_drivers.config_files import FILE_SIZE_LIMIT, Context, SourceFile, parse, read, validate
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.grammars.toml_lines import toml_key, toml_value
 from otolith_drivers.outside_text import visible
@@ -43,7 +44,7 @@ from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
 
-VERSION = 8  # of the bundles: raised when a state has other fields
+VERSION = 9  # of the bundles: raised when a state has other fields
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # that are unpacked by parts
 FMU = "fmu.txt"  # in place of the twin: which FMU has its equations
@@ -132,20 +133,28 @@ def _read_bundle(path: Path) -> Bundle:
         raise ValueError("its equations are in an FMU, which is a program: a bundle has none")
     if other := [row.filename for row in archive.infolist() if row.compress_type not in PACKINGS]:
         raise ValueError(f"{other[0]} is not packed by deflate, as bundles are: other methods unpack without a bound")
-    with archive.open(EVIDENCE) as evidence, archive.open(TWIN) as text:
+    with archive.open(EVIDENCE) as evidence:
         written = _limited(evidence, MAX_EVIDENCE_BYTES)
         if (count := written.count(b",") + written.count(b"[") + written.count(b"{")) > MAX_VALUES:
             raise ValueError(f"{count} values in it: at most {MAX_VALUES}")
-        content = json.loads(written)
-        twin = read_twin(SourceFile(Path(TWIN), _limited(text, FILE_SIZE_LIMIT).decode()))
+    content = json.loads(written)
     if (number := content["version"]) != VERSION:
         raise ValueError(f"version {number!r:.20} of the format: this Otolith reads {VERSION}")
+    machine = _text_in(archive, MACHINE)
+    tables = {key: table for key, table in parse(machine).items() if key in OwnTables.model_fields}
+    own = validate(tables, OwnTables, machine)
+    twin = own.applied_to(read_twin(_text_in(archive, TWIN)), Context(machine))
     for item in Decoder(twin).decode(tuple[UnmeasuredInput, ...], content["unmeasured"]):
         twin = without_sensor(twin, item)
     bundle: Bundle = Decoder(twin).decode(Bundle, content)
     if not bundle.windows:
         raise ValueError("it has no windows")
     return bundle
+
+
+def _text_in(archive: zipfile.ZipFile, name: str) -> SourceFile:
+    with archive.open(name) as text:
+        return SourceFile(Path(name), _limited(text, FILE_SIZE_LIMIT).decode())
 
 
 def _limited(stream: Any, limit: int) -> bytes:

@@ -42,7 +42,7 @@ from otolith.twin.expressions import (
 from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, dotted, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.units import Quantity, limit_values, to_base
+from otolith_drivers.units import Quantity, factor, limit_values, to_base
 
 # Limits keep the compile time of a kernel in minutes; docs/reference/thresholds-twin.md.
 MAX_COEFFICIENT = -0.1, 0.1  # 1/K: lowest and highest temperature coefficient
@@ -191,17 +191,15 @@ def read_twin(page: SourceFile) -> Definition:
 
 def with_performance(definition: Definition, tables: Mapping[str, OwnFigureTable], fault: Fault) -> Definition:
     """Return the twin with other figures of performance, and with other keys of its own; reports each fault."""
-    for name in tables:
+    own = {figure.name: figure for figure in definition.performance}
+    for name, table in tables.items():
         try:
             check_name(name)
         except ValueError as error:
             fault(("performance", name), str(error))
-    own = {figure.name: figure for figure in definition.performance}
-    for name, table in tables.items():
-        known, written = own.get(name), table.model_dump(exclude_none=True)
-        if known is not None:
-            written = {key: getattr(known, key) for key in FigureTable.model_fields if key != "at"} | written
-            written = {"at": dict(known.at)} | written
+        written = table.model_dump(exclude_none=True)
+        if (known := own.get(name)) is not None:
+            written = _inherited(known, written, fault) | written
         missing = [key for key, row in FigureTable.model_fields.items() if row.is_required() and key not in written]
         if missing:
             text = f"the twin has no figure {name!r}, so {missing[0]} is needed here: {nearest(name, list(own))}"
@@ -213,6 +211,18 @@ def with_performance(definition: Definition, tables: Mapping[str, OwnFigureTable
     checker.check()
     checker.check_performance()
     return complete
+
+
+def _inherited(known: Figure, written: Mapping[str, Any], fault: Fault) -> dict[str, Any]:
+    """Return the keys of a figure of the twin; what it requires is in the unit that is written for it now."""
+    keys = {key: getattr(known, key) for key in FigureTable.model_fields} | {"at": dict(known.at)}
+    if known.required is not None and "required" not in written and (unit := written.get("unit")) is not None:
+        try:
+            keys["required"] = factor(known.unit, unit)[0] * known.required
+        except ValueError as error:
+            stated = f"the twin requires {known.required:g} {known.unit}"
+            fault(("performance", known.name, "unit"), f"{error}: {stated}: write 'required' in {unit} here")
+    return keys
 
 
 def with_operation(definition: Definition, tables: Mapping[str, OperationTable], fault: Fault) -> Definition:
@@ -235,18 +245,16 @@ def with_operation(definition: Definition, tables: Mapping[str, OperationTable],
     return replace(definition, operation=tuple(ranges.values()))
 
 
-def _in_unit(written: Number, unit: str) -> float:
-    return Quantity(unit).convert(written) if isinstance(written, str) else float(written)
+def _in_unit(written: Number, unit: str, *, difference: bool = False) -> float:
+    return Quantity(unit, difference=difference).convert(written) if isinstance(written, str) else float(written)
 
 
 def _figure(name: str, table: FigureTable, units: Mapping[str, str], fault: Fault) -> Figure:
     """Return a figure with its numbers in the units of the twin; a name that is none is reported later."""
 
     def number(written: Number, unit: str | None, *at: str) -> float:
-        if not isinstance(written, str):
-            return float(written)
         try:
-            return math.nan if unit is None else Quantity(unit).convert(written)
+            return math.nan if unit is None else _in_unit(written, unit)
         except ValueError as error:
             fault(("performance", name, *at), str(error))
             return math.nan
@@ -326,9 +334,7 @@ class _Reader:
     def _number(self, location: Location, unit: str, written: Number, *, difference: bool = False) -> float:
         """A number in the declared unit, or a quantity in any unit of the same dimension; NaN after a fault."""
         try:
-            if isinstance(written, int | float):
-                return written
-            return Quantity(unit, difference=difference).convert(written)
+            return _in_unit(written, unit, difference=difference)
         except ValueError as error:
             self._fault(location, str(error))
             return math.nan

@@ -21,6 +21,7 @@ OF_THE_MACHINE = (
     "parameters",
     "components",
     "performance",
+    "operation",
     "rule",
     "noise",
     "process_noise",
@@ -38,7 +39,7 @@ def complete_lines(machine: LoadedMachine, source: SourceFile) -> Iterator[str]:
     for parameter in machine.twin.parameters:
         if parameter.role is not Role.SETTING:
             yield from _parameter(machine, parameter, data.get("parameters", {}).get(parameter.name, {}))
-    for kind in ("components", "performance"):
+    for kind in ("components", "performance", "operation"):
         for name, table in data.get(kind, {}).items():
             yield from (_header((kind, name)), *_written(table), "")
     for rule in data.get("rule", ()):
