@@ -329,6 +329,50 @@ def test_the_file_of_the_service_that_is_there_holds_for_a_machine_that_is_added
     assert "\nIPAddressDeny" not in conf.read_text(encoding="utf-8")
 
 
+def test_a_file_of_the_service_that_comes_names_the_machines_for_which_it_holds_too(
+    file: Path, tmp_path: Path
+) -> None:
+    root, beside = tmp_path / "root", tmp_path / "b"
+    installed(file, root)
+    beside.mkdir()
+    shutil.copy(tmp_path / "dc-motor.dbc", beside)
+    second = beside / "press-4.toml"
+    second.write_text(file.read_text(encoding="utf-8").replace('"dc-motor"', '"press_4"', 1), encoding="utf-8")
+    (beside / "topics").write_text("of the outlets\n", encoding="utf-8")
+    (beside / "service.toml").write_text(
+        '[outlets.prometheus]\n[outlets.webhook]\nurl = "https://tickets.local/"\nsecret_file = "topics"\n',
+        encoding="utf-8",
+    )
+    (beside / "topics").chmod(0o600)
+    for options in (["--dry-run"], []):
+        output = installed(second, root, *options)
+        (line,) = [line for line in output.splitlines() if line.startswith("warning")]
+        assert_says(line, f"{root}/etc/otolith/service.toml", "press-3.toml", "holds for them", "install them again")
+    assert "warning" not in installed(second, root)
+    (beside / "topics").write_text("others\n", encoding="utf-8")
+    assert_says(installed(second, root), f"{root}/etc/otolith/topics is also a file of press-3.toml: ")
+    unit = root / "etc/systemd/system/otolith@press-3.service.d/machine.conf"
+    before = unit.read_text(encoding="utf-8")
+    installed(file, root)
+    assert unit.read_text(encoding="utf-8") != before  # its outlets may pass on
+    (root / "etc/otolith/press-3.toml").unlink()
+    (beside / "service.toml").write_text("[history]\ndays = 3\n", encoding="utf-8")
+    assert "warning" not in installed(second, root)
+
+
+def test_a_file_of_the_service_that_is_no_longer_there_is_named(hall: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    assert "warning" not in installed(hall, root, "--dry-run")
+    installed(hall, root)
+    (hall / "service.toml").write_text("[history]\ndays = 3\n", encoding="utf-8")
+    assert "warning" not in installed(hall, root)
+    (hall / "service.toml").unlink()
+    (line,) = [line for line in installed(hall, root).splitlines() if line.startswith("warning")]
+    assert_says(line, f"{root}/etc/otolith/hall/service.toml", f"not in {hall}", "stays in force", "delete it")
+    (root / "etc/otolith/hall/service.toml").unlink()
+    assert "warning" not in installed(hall, root)
+
+
 def test_a_wrong_file_of_a_directory_installs_nothing(hall: Path, file: Path, tmp_path: Path) -> None:
     (hall / "service.toml").write_text("[history]\ndays = 0\n", encoding="utf-8")
     with raises_saying(ConfigurationError, "service.toml:2", "history.days"):

@@ -105,8 +105,7 @@ def install(path: Path, dry_run: bool, root: Path) -> None:
         others = [other.name for other in _machines_with(root / item.path, root / target.folder)]
         others = [name for name in others if name not in own]
         if _put(item, root, dry_run=dry_run) and others:
-            remedy = "if they need another one, give this file another name"
-            echo(f"warning: {root / item.path} is also a file of {some_names(others)}: {remedy}", err=True)
+            echo(f"warning: {root / item.path} is also a file of {some_names(others)}: {_remedy(item.path)}", err=True)
     for warning in _warnings(target, root):
         echo(f"warning: {warning}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
@@ -189,11 +188,23 @@ def _networks(tables: "Sequence[ZenohTable]") -> list[str] | None:
     return list(dict.fromkeys(network for table in listening for network in table.access.networks or ()))
 
 
+def _remedy(path: Path) -> str:
+    """Return what to do about a file of the service that was changed, and is also one of other machines."""
+    from otolith.service_file import SERVICE_FILE
+
+    if path.name == SERVICE_FILE:
+        return "from their next start it holds for them too: install them again, or give them these tables themselves"
+    return "if they need another one, give this file another name"
+
+
 def _warnings(target: Target, root: Path) -> Iterator[str]:
-    """Yield what is to be known of machine files that are installed already."""
+    """Yield what is to be known of files that are installed already."""
     from otolith.cli.machines import identity_of
     from otolith.service_file import SERVICE_FILE
 
+    source, there = target.files[0].parent, root / target.folder / SERVICE_FILE
+    if there.exists() and not (source / SERVICE_FILE).exists():
+        yield f"{there} is not in {source}, and stays in force: delete it, or copy it there if it is to hold"
     if target.is_hall:
         own = {file.name for file in target.files}
         left = [path for path in sorted((root / target.folder).glob("*.toml")) if path.name not in {*own, SERVICE_FILE}]
@@ -301,15 +312,23 @@ def _hosts_of(driver: Table) -> Iterator[str]:
 
 
 def _machines_with(path: Path, folder: Path) -> Iterator[Path]:
-    """Yield the machine files in ``folder`` that name the file ``path``."""
-    for machine in sorted(folder.glob("*.toml")):
-        with contextlib.suppress(ConfigurationError, OSError, ValueError):  # it is no machine file, or not readable
-            if path in [folder / name for name in named_files(machine)]:
-                yield machine
+    """Yield the machine files in ``folder`` that use the file ``path``: all use that of the service, and its files."""
+    from otolith.runtime.hall.files import files_in
+    from otolith.service_file import SERVICE_FILE
+
+    service, machines = folder / SERVICE_FILE, files_in([folder]) if folder.is_dir() else []
+    is_of_all = path == service or path in _named_by(service, folder)
+    yield from (machine for machine in machines if is_of_all or path in _named_by(machine, folder))
+
+
+def _named_by(file: Path, folder: Path) -> list[Path]:
+    with contextlib.suppress(ConfigurationError, OSError, ValueError):  # it is not there, or not readable
+        return [folder / name for name in named_files(file)]
+    return []
 
 
 def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
-    """Write a file as a whole; what it replaces is kept with a ``~``. Return whether it replaces another content."""
+    """Write a file as a whole; what it replaces is kept with a ``~``. Return whether it changes what is there."""
     from otolith.storage.disk import replace_file
 
     path = root / item.path
@@ -322,7 +341,7 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
         return False
     echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
     if dry_run:
-        return before is not None
+        return True
     umask = os.umask(0o022)  # that of root may close the folders to the service
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -333,7 +352,7 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
         status, kept = path.stat(), f"{path.name}~"
         replace_file(target.with_name(kept), before, f".{kept}.new", status.st_mode & mode, status)
     replace_file(target, item.content, f".{path.name}.new", mode)
-    return before is not None
+    return True
 
 
 def closed_folders(folders: Sequence[Path], root: Path) -> list[str]:
