@@ -329,9 +329,7 @@ def test_the_file_of_the_service_that_is_there_holds_for_a_machine_that_is_added
     assert "\nIPAddressDeny" not in conf.read_text(encoding="utf-8")
 
 
-def test_a_file_of_the_service_that_comes_names_the_machines_for_which_it_holds_too(
-    file: Path, tmp_path: Path
-) -> None:
+def test_a_file_of_the_service_that_comes_names_the_machines_for_which_it_holds_too(file: Path, tmp_path: Path) -> None:
     root, beside = tmp_path / "root", tmp_path / "b"
     installed(file, root)
     beside.mkdir()

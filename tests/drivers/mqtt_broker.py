@@ -23,6 +23,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from tests.conftest import free_port
 from tests.waiting import PATIENCE, wait_for
 
+ACCESS = {"publishClientSend": True, "publishClientReceive": True, "subscribe": False, "unsubscribe": True}
+
 
 async def serve(listener: dict[str, Any], passwords: str) -> None:
     plugins: dict[str, Any] = {}
@@ -37,16 +39,21 @@ async def serve(listener: dict[str, Any], passwords: str) -> None:
 
 @contextmanager
 def mqtt_broker(
-    port: int, folder: Path, *, tls: tuple[Path, Path] | None = None
+    port: int, folder: Path, *, tls: tuple[Path, Path] | None = None, may_subscribe: bool = True
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """The process of a broker on 127.0.0.1; ``tls`` is its certificate and key."""
     if (mosquitto := shutil.which("mosquitto")) is not None:
         # As root it would become another user, who cannot read the certificate.
         lines = [f"listener {port} 127.0.0.1", "allow_anonymous true", f"user {getpass.getuser()}"]
         lines += [f"certfile {tls[0]}", f"keyfile {tls[1]}"] if tls else []
+        if not may_subscribe:  # a file of access lists refuses no subscription, but its messages
+            (plugin,) = Path("/usr/lib").glob("*/mosquitto_dynamic_security.so")
+            (folder / "access.json").write_text(json.dumps({"defaultACLAccess": ACCESS}), encoding="utf-8")
+            lines += [f"plugin {plugin}", f"plugin_opt_config_file {folder / 'access.json'}"]
         (folder / "mosquitto.conf").write_text("\n".join(lines), encoding="utf-8")
         command = [mosquitto, "-c", str(folder / "mosquitto.conf")]
     else:
+        assert may_subscribe, "access lists need mosquitto"
         listener: dict[str, Any] = {"bind": f"127.0.0.1:{port}"}
         listener |= {"ssl": True, "certfile": str(tls[0]), "keyfile": str(tls[1])} if tls else {}
         command = [sys.executable, "-m", "tests.drivers.mqtt_broker", json.dumps(listener)]

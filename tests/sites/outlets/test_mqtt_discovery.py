@@ -170,3 +170,31 @@ def test_who_reads_learns_that_the_site_is_away(rig: MqttRig) -> None:
         assert own is not None
         own.close()  # as a site that is killed
         wait_for(lambda: rig.retained()["otolith/status"] == b"offline")
+
+
+def statuses(rig: MqttRig) -> list[bytes]:
+    """What came of the status until now, to who was there before."""
+    return [bytes(message.payload) for message in list(rig._received) if message.topic == "otolith/status"]
+
+
+def test_who_was_cut_off_and_works_again_is_not_away_once_the_broker_notices(rig: MqttRig) -> None:
+    with publisher(rig) as outlet:
+        outlet.send([view()], [], deque())
+        lost, outlet._client = outlet._client, None  # the broker still believes that it is there
+        assert lost is not None
+        outlet.send([view()], [], deque())
+        lost.loop_stop()
+        if (link := lost.socket()) is not None:
+            link.close()
+        wait_for(lambda: b"offline" in statuses(rig))
+        assert rig.retained()["otolith/status"] == b"online"
+
+
+def test_who_sends_is_not_away_because_another_one_has_ended(rig: MqttRig) -> None:
+    with publisher(rig) as before, publisher(rig) as after:
+        before.send([view()], [], deque())
+        after.send([view()], [], deque())
+        before.close()
+        wait_for(lambda: b"offline" in statuses(rig))
+        after.send([view()], [], deque())
+        assert rig.retained()["otolith/status"] == b"online"

@@ -1,5 +1,6 @@
 """What a host of Sparkplug B sees of a node: births, changes, deaths, numbers, units; read by the official schema."""
 
+import shutil
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -15,9 +16,11 @@ from tahutils.tahu.sparkplug_b_pb2 import Payload
 from otolith.health.limits import Level
 from otolith.health.schema import Status
 from otolith.outlet_tables import SparkplugOutlet
-from otolith.site.outlets.base import MachineView, OutletSetup
+from otolith.site.outlets.base import MachineView, OutletError, OutletSetup
 from otolith.site.outlets.sparkplug import SparkplugNode, build
 from otolith_drivers.grammars.sparkplug_payload import DataType, SparkplugMetric, asks_for_rebirth, payload
+from tests.drivers.mqtt_broker import mqtt_broker
+from tests.messages import raises_saying
 from tests.sites.machines import report_of
 from tests.sites.outlets.rigs import SparkplugRig, metrics_of
 from tests.waiting import wait_for
@@ -133,6 +136,15 @@ def test_a_node_that_is_cut_off_is_dead_and_the_next_has_another_number(rig: Spa
         wait_for(lambda: kinds(rig)[-2:] == ["NBIRTH", "DBIRTH hall.press_1"])
         assert metrics_of(rig.messages[-2][2])["bdSeq"].long_value == (died + 1) % 256
     assert {message.topic.split("/")[3] for message in rig._received} == {"hall.press_1"}
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="only mosquitto has such an access list here")
+def test_a_node_that_may_not_hear_commands_fails_and_says_so(tmp_path: Path) -> None:
+    rig = SparkplugRig(tmp_path)
+    with mqtt_broker(rig.port, tmp_path, may_subscribe=False), node(rig) as outlet:
+        for _ in range(2):
+            with raises_saying(OutletError, "127.0.0.1", "spBv1.0/otolith/NCMD/site", "access list of the broker"):
+                outlet.send([view()], [], deque())
 
 
 VALUES = st.one_of(

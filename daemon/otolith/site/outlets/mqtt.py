@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import secrets
 import ssl
 import threading
 from collections import deque
@@ -39,8 +40,9 @@ IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Names that a template 
 
 @dataclass(frozen=True, slots=True)
 class BrokerAccess:
-    """By what a broker lets this client in."""
+    """By what a broker lets this client in, and knows it again."""
 
+    client_id: str  # The same for each connection: the broker ends the one before it, and its will comes first
     secret: str
     tls: ssl.SSLContext | None
 
@@ -49,12 +51,13 @@ def access_of(options: BrokerOptions, setup: OutletSetup) -> BrokerAccess:
     """Return what is in the files of a table; raise ConfigurationError if one cannot be used."""
     secret = password(None if options.password_file is None else setup.folder / options.password_file)
     pair = (options.certificate, options.key)
-    return BrokerAccess(secret, tls_context(setup.folder, options.ca, pair) if options.tls else None)
+    tls = tls_context(setup.folder, options.ca, pair) if options.tls else None
+    return BrokerAccess(options.client_id or f"otolith{secrets.token_hex(8)}", secret, tls)
 
 
 def client_of(options: BrokerOptions, access: BrokerAccess) -> mqtt.Client:
     """Return a client, not connected."""
-    client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=options.client_id, reconnect_on_failure=False)
+    client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=access.client_id, reconnect_on_failure=False)
     client.connect_timeout = CONNECT_TIMEOUT
     if options.user is not None:
         client.username_pw_set(options.user, access.secret)
@@ -88,7 +91,7 @@ def connect(client: mqtt.Client, options: BrokerOptions) -> None:
 class MqttPublisher:
     """Implements :class:`otolith.site.outlets.base.Outlet`. Each connection begins with all that is known."""
 
-    def __init__(self, options: MqttOutlet, access: "BrokerAccess", language: Language, sender: str) -> None:
+    def __init__(self, options: MqttOutlet, access: BrokerAccess, language: Language, sender: str) -> None:
         self._options, self._access, self._language = options, access, language
         self._sender = sender  # A machine of a daemon, or empty for a site
         self._availability = "/".join(filter(None, (options.prefix, sender, "status")))
@@ -102,6 +105,8 @@ class MqttPublisher:
         client = self._connected()
         last: mqtt.MQTTMessageInfo | None = None
         try:
+            if views or gone or notices:  # what another connection has left there ends with it: a will comes late
+                last = _publish(client, self._availability, ONLINE, retain=True)
             for view in views:
                 for topic, document in (*self._discovery(view), *self._documents(view)):
                     last = _publish(client, topic, document, retain=True)

@@ -96,19 +96,25 @@ class SparkplugNode:
         self._births = (self._births + 1) % NUMBERS
         client, command = client_of(self._options, self._access), self._topic("NCMD")
         client.will_set(self._topic("NDEATH"), self._death(), qos=1, retain=False)
-        subscribed = threading.Event()
+        subscribed, refusal = threading.Event(), list[str]()
 
         def on_message(_: mqtt.Client, __: Any, message: mqtt.MQTTMessage) -> None:
             if message.topic == command and asks_for_rebirth(bytes(message.payload)):
                 self._rebirth.set()
 
-        client.on_message, client.on_subscribe = on_message, lambda *_: subscribed.set()
+        def on_subscribe(_: mqtt.Client, __: Any, ___: int, codes: Sequence[Any], ____: Any) -> None:
+            refusal.extend(str(code) for code in codes if code.is_failure)
+            subscribed.set()
+
+        client.on_message, client.on_subscribe = on_message, on_subscribe
         connect(client, self._options)
         self._client = client
         client.subscribe(command, 1)
-        if not subscribed.wait(ANSWER_TIMEOUT):
+        if not subscribed.wait(ANSWER_TIMEOUT) or refusal:
             self.close()
-            raise OutletError(f"{self._options.host}: does not let this client subscribe {command}")
+            reason = refusal[0] if refusal else "no answer"
+            remedy = "allow it in the access list of the broker"
+            raise OutletError(f"{self._options.host}: this client may not subscribe {command}: {reason}: {remedy}")
         self._rebirth.clear()
         self._publish_birth(client)
         return client
