@@ -1,5 +1,6 @@
 """The process of outlets: the daemon neither waits for it nor ends with it."""
 
+import logging
 import subprocess
 import sys
 import time
@@ -10,10 +11,13 @@ from typing import Any
 import psutil
 import pytest
 
+from otolith.cli.terminal import LogFormatter
 from otolith.machine import load_machine
 from otolith.runtime.hall import outlet_process
 from otolith.runtime.hall.outlet_process import OutletProcess
+from otolith.site.outlets.process import Lines
 from tests.conftest import EXAMPLES
+from tests.messages import assert_says
 from tests.sites.machines import report_of
 from tests.sites.outlets.rigs import PrometheusRig
 from tests.waiting import wait_for
@@ -27,6 +31,19 @@ def answer_nothing(connection: Any, _: Any) -> None:
     connection.recv()
     time.sleep(600.0)
     del kept
+
+
+def answer_with_a_fault(connection: Any, _: Any) -> None:
+    """What runs in a process of which an outlet has a fault of its own."""
+    lines, log = Lines(), logging.getLogger("otolith.test")
+    log.addHandler(lines)
+    try:
+        float(f"{'x' * 100_000} the end")
+    except ValueError:
+        log.exception("%s: a fault of its own", "\x1b[2Jmqtt")
+    connection.recv()
+    connection.send((None, lines.taken()))
+    connection.recv()
 
 
 def machine_file(folder: Path, rig: PrometheusRig) -> Path:
@@ -119,6 +136,26 @@ def test_why_an_outlet_fails_is_known_to_the_daemon(process: OutletProcess, rig:
     looking(process, is_told)
     rig.start()
     looking(process, lambda: not (is_told() or process.outage(key)))
+
+
+def test_a_fault_of_an_outlet_is_in_the_log_with_its_traceback(
+    rig: PrometheusRig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    process, machine = OutletProcess(f"{__name__}:answer_with_a_fault"), load_machine(machine_file(tmp_path, rig))
+    identity = machine.file.machine
+    process.serve(machine)
+
+    def is_told() -> bool:
+        process.offer(report_of(identity.name, site=identity.site))
+        return bool(caplog.records)
+
+    try:
+        looking(process, is_told)
+    finally:
+        process.stop(0.1)
+    written = LogFormatter("%(levelname)s %(message)s").format(caplog.records[0])
+    assert_says(written, "ERROR \\x1b[2Jmqtt: a fault of its own\n", "answer_with_a_fault", "\nValueError", "the end")
+    assert len(written) < 10_000
 
 
 def test_a_daemon_imports_no_library_of_an_outlet(tmp_path: Path, rig: PrometheusRig) -> None:

@@ -8,6 +8,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from otolith.machine_file import LOCAL, ZenohTable, host_of
+from otolith_drivers.common.credentials import stamp
 from otolith_drivers.config_files import Context, read
 from otolith_drivers.errors import ConfigurationError, NotValidNowError, ServiceError
 from otolith_drivers.user_dirs import runtime_directory, runtime_folders
@@ -88,7 +89,7 @@ class Access:
         """Return what differs once one of the files of certificates or passwords is replaced."""
         table, folder = self.zenoh, self.path.parent.absolute()
         names = () if table.tls is None else (table.tls.ca, table.tls.certificate, table.tls.key)
-        return tuple(_stamp(folder / name) for name in (*names, table.access.passwords) if name is not None)
+        return tuple(stamp(folder / name) for name in (*names, table.access.passwords) if name is not None)
 
     def settings(self, prefixes: Sequence[str], listen: Iterable[str]) -> tuple[Settings, Validity]:
         """Return settings to publish below ``prefixes``, and their validity.
@@ -179,14 +180,6 @@ class Access:
         policies = [{"rules": [rule["id"] for rule in rules], "subjects": [subject["id"] for subject in subjects]}]
         control: Settings = {"enabled": True, "default_permission": "deny"}
         return {**control, "rules": rules, "subjects": subjects, "policies": policies}
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    try:
-        status = path.stat()
-    except OSError:  # while it is being replaced
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 _VERIFIED: Settings = {"verify_name_on_connect": True, "close_link_on_expiration": True}

@@ -46,6 +46,15 @@ def secret(path: Path, key: tuple[str, ...]) -> bytes:
     return data
 
 
+def stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return what differs once a file is replaced; None while it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
 def certificate(path: Path, key: str) -> x509.Certificate:
     """Return the first certificate of ``path``, at ``key`` of the table; raise ConfigurationError if there is none."""
     where = ("driver", key)

@@ -102,8 +102,12 @@ class OutletProcess:
             reasons, lines = answer
             if reasons is not None:
                 self._reasons = reasons
-            for name, level, text in lines:
-                logging.getLogger(name).log(level, "%s", text)
+            for name, level, text, trace in lines:
+                logger = logging.getLogger(name)
+                if logger.isEnabledFor(level):
+                    record = logger.makeRecord(name, level, "", 0, "%s", (text,), None)
+                    record.exc_text = trace or None
+                    logger.handle(record)
 
     def _supervise(self, now: float) -> None:
         if self.child.age > OUTLET_HEALTHY_AGE:

@@ -20,6 +20,7 @@ from otolith.site.outlets.base import OutletSetup, OutletStatus
 from otolith.site.outlets.runner import OutletRunner
 from otolith.site.outlets.table import built, configured, stop
 from otolith.site.serving.counts import Counts
+from otolith_drivers.common.credentials import stamp
 from otolith_drivers.config_files import SourceFile
 from otolith_drivers.errors import OtolithError
 
@@ -27,11 +28,13 @@ log = logging.getLogger(__name__)
 
 # Threshold: docs/reference/thresholds-site.md has its origin.
 MAX_LINES = 50  # lines of the log between two answers
+MAX_LINE = 4000  # characters of one
+HALF_TRACE = 4000  # characters of the begin of a traceback, and of its end
 
-Key = tuple[str, str]
-"""Name and options of an outlet."""
-Line = tuple[str, int, str]
-"""Logger, level and text."""
+Key = tuple[str, str, tuple[object, ...]]
+"""Name and options of an outlet, and what differs once one of its files is replaced."""
+Line = tuple[str, int, str, str]
+"""Logger, level, text and traceback, which is empty without a fault."""
 
 
 class _Part:
@@ -125,7 +128,8 @@ class DaemonOutlets:
         wanted = dict[Key, Any]()
         for name, options in configured(machine.table).items():
             own = _absolute(options, machine.file.parent)
-            wanted[name, own.model_dump_json()] = own
+            stamps = tuple(stamp(value) for _, value in own if isinstance(value, Path))
+            wanted[name, own.model_dump_json(), stamps] = own
         self._part_with(machine.key, [key for key in self._groups if key not in wanted])
         self._faults[machine.key] = []
         for key, options in wanted.items():
@@ -196,7 +200,7 @@ def _absolute(options: Any, folder: Path) -> Any:
     return options.model_copy(update=files)
 
 
-class _Lines(logging.Handler):
+class Lines(logging.Handler):
     """Keeps lines of the log until they are sent to the daemon."""
 
     def __init__(self) -> None:
@@ -205,7 +209,10 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a line."""
-        self._kept.append((record.name, record.levelno, record.getMessage()))
+        trace = logging.Formatter().formatException(record.exc_info) if record.exc_info else ""
+        if len(trace) > 2 * HALF_TRACE:
+            trace = f"{trace[:HALF_TRACE]}\n...\n{trace[-HALF_TRACE:]}"
+        self._kept.append((record.name, record.levelno, record.getMessage()[:MAX_LINE], trace))
 
     def taken(self) -> tuple[Line, ...]:
         """Return what was kept since the last call."""
@@ -214,7 +221,7 @@ class _Lines(logging.Handler):
 
 def main(connection: Connection, machines: Sequence[MachineOutlets]) -> None:
     """Pass on what the daemon sends until it ends."""
-    lines = _Lines()
+    lines = Lines()
     logging.getLogger("otolith").addHandler(lines)
     logging.getLogger("otolith").setLevel(logging.INFO)
     logging.getLogger().setLevel(logging.ERROR)  # libraries tell of each connection that fails
