@@ -123,6 +123,72 @@ def test_a_process_that_hangs_or_is_too_large_is_killed_and_delays_nobody(
         process.stop(0.1)
 
 
+def test_a_process_without_any_table_ends_and_begins_again_with_one(
+    process: OutletProcess, rig: PrometheusRig, tmp_path: Path
+) -> None:
+    file = machine_file(tmp_path, rig)
+    machine, without = load_machine(file), load_machine(EXAMPLES / "dc-motor-in-process.toml")
+    key = f"{machine.file.machine.site}/{machine.file.machine.name}"
+    for starts, end in enumerate((lambda: process.serve(without), lambda: process.leave(key, is_gone=True)), start=1):
+        process.serve(machine)
+        looking(process, rig.is_open)
+        process.leave(key, is_gone=False)  # a machine that cannot be served has its outlets, which say so
+        process.serve(machine)
+        end()
+        looking(process, lambda: not process.child.alive)
+        assert (process.child.starts, process.outage(key), rig.is_open()) == (starts, "", False)
+    process.poll(time.monotonic())
+    assert (process.child.starts, process.dropped) == (2, 0)
+
+
+def test_a_machine_that_cannot_be_served_keeps_its_outlets(
+    process: OutletProcess, rig: PrometheusRig, tmp_path: Path
+) -> None:
+    machine = load_machine(machine_file(tmp_path, rig))
+    identity = machine.file.machine
+    process.serve(machine)
+
+    def state() -> str | None:
+        if identity.name in served:
+            process.offer(report_of(identity.name, None, time.time(), site=identity.site))
+        return rig.states().get(identity.name)
+
+    served = {identity.name}
+    looking(process, lambda: state() == "OK")
+    served.clear()
+    process.leave(f"{identity.site}/{identity.name}", is_gone=False)
+    looking(process, lambda: state() == "NO DATA")
+    process.serve(load_machine(EXAMPLES / "dc-motor-in-process.toml"))  # begun anew, without a table
+    looking(process, lambda: not process.child.alive)
+
+
+def test_a_change_of_a_machine_waits_until_there_is_room(
+    process: OutletProcess, rig: PrometheusRig, tmp_path: Path
+) -> None:
+    file = machine_file(tmp_path, rig)
+    machine, before = load_machine(file), rig.port
+    identity = machine.file.machine
+    process.serve(machine)
+    looking(process, rig.is_open)
+    other = PrometheusRig(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace(str(before), str(other.port)), encoding="utf-8")
+    (child,) = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+    child.suspend()
+    while not process.dropped:
+        process.offer(report_of(identity.name, site=identity.site))
+    process.serve(load_machine(file))
+    child.resume()
+    looking(process, lambda: other.is_open() and not rig.is_open())
+    child.suspend()
+    dropped = process.dropped
+    while process.dropped == dropped:
+        process.offer(report_of(identity.name, site=identity.site))
+    process.leave(f"{identity.site}/{identity.name}", is_gone=True)
+    child.resume()
+    looking(process, lambda: not other.is_open())
+    assert process.child.starts == 1
+
+
 def test_why_an_outlet_fails_is_known_to_the_daemon(process: OutletProcess, rig: PrometheusRig, tmp_path: Path) -> None:
     machine = load_machine(machine_file(tmp_path, rig))
     key = f"{machine.file.machine.site}/{machine.file.machine.name}"

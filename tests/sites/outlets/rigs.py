@@ -298,6 +298,11 @@ class PrometheusRig(Rig, name="prometheus"):
         if self._held is not None:
             self._held.close()
 
+    def is_open(self) -> bool:
+        """Whether scrapes are answered."""
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
     def states(self) -> dict[str, str]:
         with suppress(OSError):  # it may not listen yet
             return {sample.labels["machine"]: sample.labels["state"].upper().replace("_", " ")

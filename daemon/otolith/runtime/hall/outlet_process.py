@@ -34,6 +34,9 @@ class OutletProcess:
         self.child = ChildProcess("otolith-outlets", main, OUTLET_ROOM)
         self.dropped = 0  # Reports that no outlet has received
         self._machines: dict[str, MachineOutlets] = {}
+        self._unserved: set[str] = set()  # Those of which outlets tell that nobody serves them
+        self._changes: dict[str, MachineOutlets | bool] = {}  # That wait for room
+        self._is_ending = False
         self._reasons: Mapping[str, str] = {}
         self._unanswered = 0
         self._effort = Effort()
@@ -43,22 +46,25 @@ class OutletProcess:
         """Pass on a machine from now on, by the tables of its file, or by those that it has now."""
         identity = machine.file.machine
         own = MachineOutlets(identity.site, identity.name, machine.path_of("outlets"), machine.file.outlets)
-        if not own.table.names and own.key not in self._machines:
+        if not own.table.names:
+            self.leave(own.key, is_gone=True)
             return
+        self._unserved.discard(own.key)
         self._machines[own.key] = own
         self.child.widen(OUTLET_ROOM * len(self._machines))
-        self._send(own.key, own)
+        self._change(own.key, own)
 
     def leave(self, key: str, *, is_gone: bool) -> None:
-        """Pass on a machine no longer; ``is_gone`` if its file was removed."""
-        if self._machines.pop(key, None) is not None:
-            self._send(key, is_gone)
+        """Pass on a machine no longer; ``is_gone`` if its file or its tables were removed."""
+        if self._machines.pop(key, None) is None and key not in self._unserved:
+            return
+        (self._unserved.discard if is_gone else self._unserved.add)(key)
+        self._change(key, is_gone)
 
     def offer(self, document: ReportDocument) -> None:
         """Give it a report, without waiting."""
         key = f"{document.site}/{document.machine}"
-        own = self._machines.get(key)
-        if own is not None and own.table.names and not self._send(key, (self.dropped, document.to_json().encode())):
+        if key in self._machines and not self._send(key, (self.dropped, document.to_json().encode())):
             self.dropped += 1
 
     def outage(self, key: str) -> str:
@@ -76,16 +82,38 @@ class OutletProcess:
         self._looked_at = now
         self._read(now)
         if self.child.alive:
+            self._send_changes()
+            self._end_without_machines()
             self._supervise(now)
             return
         self.dropped += self._unanswered
-        self._unanswered, self._reasons = 0, {}
+        self._unanswered, self._reasons, self._is_ending = 0, {}, False
+        self._changes.clear()  # it begins with the machines as they are
+        self._unserved.clear()
         if self._machines and self.child.may_restart(now):
             self.child.start(tuple(self._machines.values()))
 
     def stop(self, seconds: float) -> None:
         """Let it tell for up to ``seconds`` that the daemon ends."""
         self.child.stop(seconds)
+
+    def _change(self, key: str, content: MachineOutlets | bool) -> None:
+        """Send what has changed of a machine, as soon as there is room."""
+        self._changes[key] = content
+        self._send_changes()
+
+    def _send_changes(self) -> None:
+        for key in tuple(self._changes):
+            if not self._send(key, self._changes[key]):
+                return
+            del self._changes[key]
+
+    def _end_without_machines(self) -> None:
+        """Let it end once no machine has a table."""
+        is_needed = self._machines or self._unserved or self._changes
+        if not (is_needed or self._is_ending) and self.child.offer(None):
+            self._is_ending = True
+            self.child.reset_backoff()
 
     def _send(self, key: str, content: object) -> bool:
         if not (self.child.alive and self.child.offer((key, content))):
