@@ -200,7 +200,7 @@ def _absolute(options: Any, folder: Path) -> Any:
     return options.model_copy(update=files)
 
 
-class Lines(logging.Handler):
+class KeptLines(logging.Handler):
     """Keeps lines of the log until they are sent to the daemon."""
 
     def __init__(self) -> None:
@@ -221,7 +221,7 @@ class Lines(logging.Handler):
 
 def main(connection: Connection, machines: Sequence[MachineOutlets]) -> None:
     """Pass on what the daemon sends until it ends."""
-    lines = Lines()
+    lines = KeptLines()
     logging.getLogger("otolith").addHandler(lines)
     logging.getLogger("otolith").setLevel(logging.INFO)
     logging.getLogger().setLevel(logging.ERROR)  # libraries tell of each connection that fails
