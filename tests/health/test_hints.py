@@ -124,6 +124,14 @@ def test_a_hint_hides_no_fault_that_comes_and_goes() -> None:
     assert last.hints
 
 
+def test_a_report_says_whether_what_begins_now_is_a_change() -> None:
+    reports = assessed([*agreeing(KNOWN_WINDOWS), *with_finding(late(LENGTH * KNOWN_WINDOWS), KNOWN_WINDOWS)])
+    flags = [health_of(document).has_agreed for document in reports]
+    assert flags == [None] * (KNOWN_WINDOWS - 1) + [True] * 9
+    state = _state_after(agreeing(KNOWN_WINDOWS)).without_hints("the noise in the machine file has changed")
+    assert health_of(assessed(agreeing(1, KNOWN_WINDOWS), state)[-1]).has_agreed is None
+
+
 def test_another_machine_file_drops_the_hints_of_the_one_before() -> None:
     windows = [*agreeing(KNOWN_WINDOWS), *with_finding(late(0.0), KNOWN_WINDOWS)]
     state = _state_after(windows)

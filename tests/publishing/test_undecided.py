@@ -144,6 +144,18 @@ def test_before_commissioning_what_does_not_fit_is_the_file_and_the_advice_is_to
         assert say("changed") not in text, name
 
 
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_a_fault_of_a_machine_that_was_as_its_file_says_is_none_of_the_file(language: Language, tmp_path: Path) -> None:
+    """To commission it would write the fault into the file."""
+    say, document = texts_in(language), uncommissioned(language, explained=False)
+    assert document.health is not None
+    health = document.health.model_copy(update={"has_agreed": True})
+    document = document.model_copy(update={"health": health, "findings": undecided(language).findings})
+    for name, text in shown(document, tmp_path).items():
+        assert "otolith commission" not in text, name
+        assert say("undecided_advice") in text, name
+
+
 def test_where_the_example_explains_the_machine_nothing_is_advised(tmp_path: Path) -> None:
     for name, text in shown(uncommissioned("en", explained=True), tmp_path).items():
         assert "otolith commission" not in text, name

@@ -222,9 +222,9 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None and not event.is_hint and event.id not in absent]
     document = _states(plan, state.document, report, current, state.undetermined)
-    was_ok = {key for key, item in observations.items() if item.level is Level.OK}
-    state = replace(state, records=records, document=document, inside=state.inside | was_ok, dropped=(), notes=())
-    state = replace(state, shelves=shelves)
+    document = document.model_copy(update={"has_agreed": True if state.known_since is not None else None})
+    inside = state.inside | {key for key, item in observations.items() if item.level is Level.OK}
+    state = replace(state, records=records, shelves=shelves, document=document, inside=inside, dropped=(), notes=())
     return state, report.model_copy(update={"health": document, "events": tuple(events)})
 
 

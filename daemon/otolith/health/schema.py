@@ -235,6 +235,7 @@ class HealthDocument(PartDocument):
     parts: dict[str, PartDocument]
     language: Language = "en"  # Of the reasons
     timezone: str | None = None  # IANA name of the plant's zone, in which people read times
+    has_agreed: bool | None = None  # True once it was as its file says for long: what begins then is a change
 
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"

@@ -477,7 +477,12 @@ def undecided_finding(document: ReportDocument) -> FindingDocument | None:
 
 
 def awaits_commissioning(document: ReportDocument) -> bool:
-    """Whether the twin computes with values of its example, and does not explain the window: nothing has happened."""
+    """Whether the twin computes with values of its example, and does not explain the window: nothing has happened.
+
+    Once it has explained the machine for long, something has.
+    """
+    if document.health is not None and document.health.has_agreed:
+        return False
     rows = document.parameters.values()
     if any(row.baseline is not None for row in rows) or not any(row.is_example for row in rows):
         return False
