@@ -47,8 +47,8 @@ def seconds_of(written: object, argument: str) -> float:
     """Return a time in s: a finite number, or a date with its zone, which is a Unix time."""
     if isinstance(written, datetime | np.datetime64):
         return float(_unix_seconds(written, np.array([written], dtype=object), argument)[0])
-    if isinstance(written, Real) and not isinstance(written, bool) and math.isfinite(written):
-        return float(written)
+    if isinstance(written, Real) and not isinstance(written, bool) and math.isfinite(number := _float(written)):
+        return number
     remedy = "give seconds as a number, or a datetime with its zone"
     raise ConfigurationError(f"{argument}: {shown(written)} is no time: {remedy}")
 
@@ -104,7 +104,8 @@ def _rows(count: int) -> str:
 
 def _columns(inputs: Any, units: Mapping[str, str]) -> dict[str, Array]:
     """Return the column of each of the ``units`` by its name, in its unit."""
-    headers = list(inputs) if isinstance(inputs, Mapping) else list(getattr(inputs, "column_names", inputs.columns))
+    names = inputs if isinstance(inputs, Mapping) else getattr(inputs, "column_names", None)
+    headers = list(inputs.columns if names is None else names)
     named = [(name_and_unit(str(header).strip()), header) for header in headers]
     columns = {}
     for name, unit in units.items():
@@ -156,13 +157,24 @@ def _numbers(column: Any, name: str, *, is_time: bool) -> Array:
 
 def _number(value: object, name: str, row: int) -> float:
     if isinstance(value, Real) and not isinstance(value, bool):
-        return float(value)
+        return _float(value)
     raise ConfigurationError(f"inputs: {name} has {shown(value)} in row {row}, which is no number: give numbers")
+
+
+def _float(value: Any) -> float:
+    """Return a number as one of 64 bits, infinite if it is too large: whole numbers and fractions have no bound."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _unix_seconds(column: Any, values: NDArray[Any], name: str) -> Array:
     """Return the dates of a column in Unix s; a table of pyarrow knows their zone, and gives values without it."""
     if values.dtype.kind == "M" and getattr(getattr(column, "type", None), "tz", None):
+        gaps = np.flatnonzero(np.isnat(values))
+        if len(gaps):
+            raise ConfigurationError(f"{name} has no date in row {gaps[0]}: write one, or leave the row out")
         return np.asarray(values.astype("datetime64[us]").astype(np.int64) / 1e6)
     for row, value in enumerate(values.tolist()):
         if not isinstance(value, datetime) or value.tzinfo is None:

@@ -62,7 +62,10 @@ def counted(number: int, noun: str) -> str:
 
 def shown(value: object) -> str:
     """Return a value from outside as a message has it, shortened."""
-    text = repr(value).replace("\n", " ")  # of an array
+    try:
+        text = repr(value).replace("\n", " ")  # of an array
+    except ValueError:  # a whole number of thousands of digits
+        text = f"a value of type {type(value).__name__}"
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 

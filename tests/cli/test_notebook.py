@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime, timedelta
+from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,9 @@ WRONG_PLANS: list[tuple[Any, tuple[str, ...]]] = [
     (with_column("t", [datetime(2026, 1, 31, 12), datetime(2026, 1, 31, 13)]), ("t", "2026", "zone")),  # noqa: DTZ001
     (with_column("t", np.array(["2026-01-31", "2026-02-01"], dtype="datetime64[s]")), ("t", "2026", "zone")),
     (with_column("t", [0.0, 1e9]), ("inputs", "1000000", "0.01 s")),
+    (with_column("t", [0, 10**400]), ("t", "row 1", "finite")),
+    (with_column("V_a", [Fraction(10**400), 1]), ("V_a", "row 0", "finite")),
+    (with_column("t", [NOON, None]), ("t", "None", "row 1", "zone")),
     (without("T_load"), ("T_load", "missing", "N*m", "V_a")),
     (without("t"), ("t", "missing")),
     ({}, ("t", "missing", "no column")),
@@ -107,6 +111,11 @@ WRONG_CALLS: list[tuple[Callable[[Twin, Path], object], tuple[str, ...]]] = [
     (lambda twin, _: twin.at("yesterday"), ("time", "yesterday", "seconds")),  # type: ignore[arg-type]
     (lambda twin, _: twin.at(None), ("time", "None", "seconds")),  # type: ignore[arg-type]
     (lambda twin, _: twin.at(math.nan), ("time", "nan")),
+    (lambda twin, _: twin.at(10**400), ("time", "seconds")),
+    (lambda twin, _: twin.at(10**5000), ("time", "seconds")),
+    (lambda twin, _: twin.simulate(PLAN, seed=-(10**5000)), ("seed", "whole number")),
+    (lambda twin, _: twin.with_value("R_a", 10**400), ("R_a", "ohm")),
+    (lambda twin, _: twin.simulate(span=(0, 10**400)), ("span[1]", "seconds")),
     (lambda twin, _: twin.at(datetime(2026, 1, 31)), ("time", "2026", "zone")),  # noqa: DTZ001
     (lambda twin, _: twin.at(NOON), ("history",)),
     (lambda twin, _: twin.with_value("R_b", 5.0), ("R_b", "R_a")),
@@ -164,6 +173,17 @@ def test_a_wrong_argument_is_named(
     assert "\n" not in str(caught.value)
 
 
+class NamedColumns:
+    """A table that has ``column_names`` and no ``columns``, as an interface for several libraries may."""
+
+    def __init__(self, columns: dict[str, Any]) -> None:
+        self.column_names = list(columns)
+        self._columns = columns
+
+    def __getitem__(self, name: str) -> Any:
+        return self._columns[name]
+
+
 TABLES: list[Any] = [
     PLAN,
     {key: np.array(column) for key, column in PLAN.items()},
@@ -180,6 +200,7 @@ TABLES: list[Any] = [
     pandas.DataFrame(PLAN).convert_dtypes(),
     pa.table(PLAN),
     pa.table({**PLAN, "t": pa.array([NOON, NOON + timedelta(seconds=1)], pa.timestamp("ms", tz="Europe/Berlin"))}),
+    NamedColumns(PLAN),
 ]
 
 
@@ -207,6 +228,9 @@ def test_the_times_of_a_plan_with_dates_are_unix_times(twin: Twin) -> None:
         (pa.table({**PLAN, "V_a": [1.0, None]}), ("V_a", "row 1")),
         (pa.table([[0.0], [1.0], [1.0], [0.0]], names=["t", "V_a", "V_a", "T_load"]), ("V_a", "2 columns")),
         (pa.table({**PLAN, "t": pa.array([0, 1], pa.timestamp("s"))}), ("t", "zone")),
+        (pa.table({**PLAN, "t": pa.array([None, NOON], pa.timestamp("ms", tz="UTC"))}), ("t", "row 0")),
+        (pa.table({**PLAN, "t": pa.array([NOON, None], pa.timestamp("ns", tz="UTC"))}), ("t", "row 1")),
+        (pandas.DataFrame({**PLAN, "t": pandas.to_datetime([None, NOON], utc=True)}), ("t", "row 0")),
     ],
 )
 def test_a_wrong_table_is_named(twin: Twin, table: Any, parts: tuple[str, ...]) -> None:
