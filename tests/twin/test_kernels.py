@@ -1,6 +1,7 @@
 """Compiled kernels of every library twin: predictions, order, derivatives and Kalman gains against references."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from otolith.machine import find_twin
 from otolith.machine import library_twins as library
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
+from otolith.twin.language import read_twin
+from otolith_drivers.config_files import SourceFile
 from tests.twin.reference import Reference
 
 PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "fan": 0.05, "hydraulic_actuator": 0.01,
@@ -237,3 +240,21 @@ def test_rounding_errors_end_the_search_for_substeps() -> None:
     drive = Excitation.uniform(np.zeros((RECORDS, 1)), 0.001)
     far = np.array([3.0e8, 1.0e8])
     assert kernel_of(twin).substeps(nominal(twin), far, drive, np.array([1e-9])) <= 8
+
+
+def test_a_twin_with_many_slopes_compiles() -> None:
+    """Each of its states depends on all others: 36 slopes, of which CPython makes no tuple at once."""
+    names = [f"x_{index}" for index in range(6)]
+    total = " + ".join(names)
+    text = '[twin]\nname = "chain"\ntitle = "chain"\nsource = "none"\n[states]\n'
+    text += "".join(f'{name} = {{ unit = "1", meaning = "{name}" }}\n' for name in names) + "[outputs]\n"
+    text += "".join(f'{name} = {{ unit = "1", noise = 1, meaning = "{name}" }}\n' for name in names)
+    text += '[parameters]\nk = { unit = "1/s", nominal = 0.3, bounds = [0, 1], role = "estimated", meaning = "rate" }\n'
+    text += "[equations]\n" + "".join(f'"der({name})" = "-k*{name}*({total})"\n' for name in names)
+    twin = read_twin(SourceFile(Path("chain.toml"), text))
+    drive, start = Excitation.uniform(np.zeros((20, 0)), 0.01), np.linspace(0.5, 1.0, 6)
+    slopes = kernel_of(twin).sensitivities(nominal(twin), start, drive).slopes
+    ahead, behind = (
+        kernel_of(twin).simulate(np.array([[0.3 + step]]), start[None], drive)[0] for step in (1e-5, -1e-5)
+    )
+    np.testing.assert_allclose(slopes[:, :, 0], (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-9)

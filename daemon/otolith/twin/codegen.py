@@ -24,7 +24,7 @@ from otolith_drivers.units import to_base
 # Of functions that kernels alone call: code that lets Python and C call them takes a fifth of their compile time.
 INNER = "no_cpython_wrapper=True, no_cfunc_wrapper=True"
 DECORATOR = f'@njit(error_model="numpy", fastmath={{"contract"}}, {INNER})'
-
+LONGEST_TUPLE = 30  # values that CPython puts into a tuple without a list in between, which numba does not compile
 
 # Step of a central difference by a state, in its unit. Its truncation error grows with the square of the step, its
 # rounding error with the inverse: 1e-6 of the value is near the cube root of the floating-point resolution.
@@ -230,9 +230,11 @@ class KernelCode:
         lines = [*before, *lines, *after]
         shared, results = sympy.cse(expressions, symbols=sympy.numbered_symbols("t_", real=True), order="none")
         lines += [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
-        returned = ", ".join(PRINTER.doprint(result) for result in results)
+        texts = [PRINTER.doprint(result) for result in results]
+        parts = [texts[at : at + LONGEST_TUPLE] for at in range(0, len(texts), LONGEST_TUPLE)]
+        returned = " + ".join(f"({', '.join(part)},)" for part in parts)
         head = f"def {name}({self.arguments(name, self.x, self.u)}):"
-        return [DECORATOR, head, *indent([*lines, f"return ({returned},)"]), "", ""]
+        return [DECORATOR, head, *indent([*lines, f"return {returned}"]), "", ""]
 
     def arguments(self, function: str, states: Sequence[str], inputs: Sequence[str]) -> str:
         """Arguments of such a function: states, inputs and the constants that it uses."""
