@@ -72,6 +72,16 @@ def _new_recording(context: click.Context, option: click.Parameter, path: Path |
     return new_file(context, option, path)
 
 
+def _new_page(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
+    """Return the file of a page, whose folder is made."""
+    if path is not None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise click.BadParameter(f"{str(path)!r}: its folder cannot be made: {error.strerror}") from error
+    return new_file(context, option, path)
+
+
 def _watched(_: click.Context, __: click.Parameter, text: str) -> str:
     from otolith.cli.machines import is_file, key_of
 
@@ -216,7 +226,7 @@ def check(file: Path, data: tuple[Path, ...], no_device: bool, as_json: bool) ->
 @click.argument("data", metavar="DATA...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
 @click.option("--recording", type=FILE, callback=_new_recording, help="Record into this file, as the daemon does.")
-@click.option("--report", "page", type=FILE, callback=new_file, metavar="FILE",
+@click.option("--report", "page", type=FILE, callback=_new_page, metavar="FILE",
               help="Write this new HTML page, as 'otolith report' does.")  # fmt: skip
 @click.option("--history", "folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
               help="Keep the history of the reports in this folder.")  # fmt: skip
