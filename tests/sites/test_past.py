@@ -15,6 +15,7 @@ from otolith.site.collector import Collector
 from otolith.site.known import Knowledge
 from otolith.site.past import PARALLEL, PastQuery, past_of
 from otolith.site.serving import past_pages
+from otolith.site.serving.counts import Counts
 from otolith.site.settings import SiteFile
 from tests.sites.machines import report_of, sent
 from tests.storage.histories import MACHINE, SITE, START
@@ -26,6 +27,7 @@ class Works:
     def __init__(self) -> None:
         self.knowledge, self.lock, self.asked = Knowledge(), threading.Lock(), 0
         self.dropped: Counter[str] = Counter()
+        self.hindered: Counts = Counter()
         self.knowledge.take(*sent(report_of()), START)
 
     def where(self, *_: str) -> str:
