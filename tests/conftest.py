@@ -36,6 +36,7 @@ SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurre
 # The slowest files of the long tests, then of the others. Workers start with them, so that none of them is left alone
 # at the end; files that compute alternate with files that wait for real time.
 SLOWEST = (
+    "system/test_hall_kills.py",
     "system/test_outages.py",
     "adaptation/test_sampling_coverage.py",
     "adaptation/test_measured_like.py",
