@@ -118,10 +118,7 @@ class MqttPublisher:
             for notice in notices:
                 topic = f"{self._options.prefix}/{notice.site}/{notice.machine}/event"
                 last = _publish(client, topic, dict(notice.document()), retain=False)
-            if last is not None:
-                last.wait_for_publish(ANSWER_TIMEOUT)
-            if not client.is_connected() or (last is not None and not last.is_published()):
-                raise ConnectionError("the broker does not confirm what it is sent")
+            wait_until_taken(client, last)
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
             raise OutletError(failure(error, self._options.host)) from error
@@ -225,11 +222,23 @@ class MqttPublisher:
 
 def _publish(client: mqtt.Client, topic: str, document: Any, *, retain: bool) -> mqtt.MQTTMessageInfo:
     text = document if document is None or isinstance(document, str) else json_text(document)
-    content = None if text is None else text.encode(errors="replace")
-    info = client.publish(topic, content, qos=1, retain=retain)
+    return publish(client, topic, None if text is None else text.encode(errors="replace"), qos=1, retain=retain)
+
+
+def publish(client: mqtt.Client, topic: str, content: bytes | None, *, qos: int, retain: bool) -> mqtt.MQTTMessageInfo:
+    """Publish bytes; raise ConnectionError if the connection is lost."""
+    info = client.publish(topic, content, qos=qos, retain=retain)
     if info.rc not in (mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_QUEUE_SIZE):
         raise ConnectionError(mqtt.error_string(info.rc))
     return info
+
+
+def wait_until_taken(client: mqtt.Client, last: mqtt.MQTTMessageInfo | None) -> None:
+    """Wait for the end of the ``last`` message; raise ConnectionError if the broker does not take it."""
+    if last is not None:
+        last.wait_for_publish(ANSWER_TIMEOUT)
+    if not client.is_connected() or (last is not None and not last.is_published()):
+        raise ConnectionError("the broker does not take what it is sent")
 
 
 def _object_id(key: str) -> str:

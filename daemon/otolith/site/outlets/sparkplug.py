@@ -18,7 +18,16 @@ from otolith.outlet_tables import SparkplugOutlet
 from otolith.site.known import MAX_PARAMETERS
 from otolith.site.outlets.base import MachineView, Notice, OutletError, OutletSetup
 from otolith.site.outlets.connections import failure
-from otolith.site.outlets.mqtt import ANSWER_TIMEOUT, CLOSING, BrokerAccess, access_of, client_of, connect
+from otolith.site.outlets.mqtt import (
+    ANSWER_TIMEOUT,
+    CLOSING,
+    BrokerAccess,
+    access_of,
+    client_of,
+    connect,
+    publish,
+    wait_until_taken,
+)
 from otolith_drivers.grammars.json_lines import json_text
 from otolith_drivers.grammars.sparkplug_payload import (
     REBIRTH,
@@ -69,10 +78,7 @@ class SparkplugNode:
             for notice in notices:
                 event = SparkplugMetric("Event", DataType.STRING, json_text(dict(notice.document())), _now())
                 last = self._publish(client, "NDATA", "", [event])
-            if last is not None:
-                last.wait_for_publish(ANSWER_TIMEOUT)
-            if not client.is_connected() or (last is not None and not last.is_published()):
-                raise ConnectionError("the broker does not take what it is sent")
+            wait_until_taken(client, last)
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
             raise OutletError(failure(error, self._options.host)) from error
@@ -176,10 +182,7 @@ class SparkplugNode:
     ) -> mqtt.MQTTMessageInfo:
         content = payload(metrics, _now(), self._number)
         self._number = (self._number + 1) % NUMBERS
-        info = client.publish(self._topic(kind, device), content, qos=0, retain=False)
-        if info.rc not in (mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_QUEUE_SIZE):
-            raise ConnectionError(mqtt.error_string(info.rc))
-        return info
+        return publish(client, self._topic(kind, device), content, qos=0, retain=False)
 
 
 def _now() -> int:
