@@ -192,7 +192,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     source = read(path)
     data = parse(source)
     if path.name == SERVICE_FILE and "machine" not in data:
-        data.setdefault("service", {})  # it is told as what it is, whatever it has
+        data.setdefault("service", {})  # so that the error names a file of a service
     expect(source, data, "machine")
     file, of_service = with_service_file(validate(data, MachineFile, source), path)
     context = Context(source)

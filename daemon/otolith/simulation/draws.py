@@ -4,6 +4,7 @@ Draws come in pairs with opposite deviations, so that their median is that of th
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,17 @@ from otolith.estimation.problem import indices
 from otolith.simulation.what_if import supposed_values
 
 PAIRS = 200  # Of draws: the ends of a band are exact to 5 % of its width. docs/reference/thresholds-simulation.md
+
+
+class Future(IntEnum):
+    """What becomes of a trend after the last window.
+
+    The data do not say it, so each is that of equally many draws.
+    """
+
+    ENDS = 0  # At once, as after a warming or a repair
+    DECAYS = 1  # As the filter lets it
+    GOES_ON = 2
 
 
 def opposite(deviates: Array) -> Array:
@@ -44,14 +56,9 @@ class ParameterDraws:
     _bounds: tuple[Array, Array]
 
     @property
-    def _future(self) -> NDArray[np.int64]:
-        """What becomes of the trends (draws,): 0 they end, 1 decay, 2 go on."""
-        return np.tile(np.arange(len(self.values) // 2) % 3, 2)
-
-    @property
     def lasts(self) -> Mask:
-        """The draws (draws,) whose trends do not end at once: of them is the line, within the band of all."""
-        return self._future > 0
+        """Whether the trends of a draw (draws,) last; the predicted line is the median of these draws."""
+        return np.not_equal(_futures(len(self.values) // 2), Future.ENDS)
 
     @classmethod
     def of(cls, posterior: Posterior, random: np.random.Generator, pairs: int = PAIRS) -> "ParameterDraws":
@@ -71,23 +78,24 @@ class ParameterDraws:
         fixed = [index for index, item in enumerate(problem.free) if item.name in supposed]
         trends = drawn[:, free:]
         trends[:, held + fixed] = noise[:, held + fixed] = 0.0
+        ended = _futures(pairs) == Future.ENDS
+        trends[ended] = noise[ended] = 0.0
         values = np.clip(drawn[:, :free], *problem.bounds)
         return cls(values, trends, noise, problem.bounds)
 
     def advance(self, seconds: float, random: np.random.Generator) -> None:
-        """Move all draws by ``seconds``.
-
-        The data do not say what becomes of a trend: in equally many draws it ends at once, as a warming or a repair
-        does, decays as the filter lets it, or goes on.
-        """
+        """Move all draws by ``seconds``."""
         (_, run), (_, fade) = process_model(seconds)[0]
         root = root_of(process_model(seconds)[1])
         pairs = len(self.values) // 2
         deviates = opposite(random.standard_normal((pairs, self.values.shape[1], 2)) @ root.T)
         noise = self._trend_noise[..., None] * deviates
-        future = self._future[:, None]
-        moved = self.values + np.choose(future, (0.0, run, seconds)) * self._trends
-        self._trends = np.choose(future, (0.0, fade, 1.0)) * self._trends
-        continues = future > 0
-        moved, self._trends = moved + continues * noise[..., 0], self._trends + continues * noise[..., 1]
+        goes_on = (_futures(pairs) == Future.GOES_ON)[:, None]
+        moved = self.values + np.where(goes_on, seconds, run) * self._trends + noise[..., 0]
+        self._trends = np.where(goes_on, 1.0, fade) * self._trends + noise[..., 1]
         self.values = np.clip(moved, *self._bounds)
+
+
+def _futures(pairs: int) -> NDArray[np.int64]:
+    """Return what becomes of the trends of each draw (draws,), a :class:`Future`."""
+    return np.tile(np.arange(pairs) % len(Future), 2)
