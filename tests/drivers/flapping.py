@@ -58,7 +58,11 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
     def flap() -> None:
         """Break a bus once. While the driver is reopening it, there is no descriptor to break: wait for the next."""
         wait_for(lambda: bool(opened))
-        os.dup2(no_socket, opened.pop().fileno())  # the kernel reports from now on that this is no socket
+        bus = opened.pop()
+        descriptor = bus.fileno()
+        os.dup2(no_socket, descriptor)  # the kernel reports from now on that this is no socket
+        if bus.fileno() != descriptor:  # the driver has closed it meanwhile: this one is ours
+            os.close(descriptor)
 
     try:
         yield driver, flap

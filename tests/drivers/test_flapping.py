@@ -16,13 +16,20 @@ from tests.variants import often
 FEW, HOUR, DAY = 20, 60, 24 * 60  # failures
 
 PROGRAM = """
-import gc, json, sys, time
+import gc, json, os, sys, time
 import psutil
 from tests.drivers.flapping import RIGS
 from tests.waiting import wait_for
 
 flaps, process = int(sys.argv[2]), psutil.Process()
-measured = []
+measured, files = [], []
+
+def open_files():
+    for descriptor in os.listdir("/proc/self/fd"):
+        try:
+            yield f"{descriptor} {os.readlink('/proc/self/fd/' + descriptor)}"
+        except OSError:
+            pass  # that of the listing
 
 def resources():
     # Threads and sockets of the other end remain for a moment after a failure: the least of some moments is ours. On a
@@ -47,11 +54,12 @@ with RIGS[sys.argv[1]]() as (driver, flap):
         wait_for(lambda: delivered[0] > before)
         if index % (flaps // 10) == 0:
             measured.append(resources())
+            files.append(sorted(open_files()))
         flap()
     wait_for(lambda: driver.counters().reconnects >= 0.95 * flaps)
     counters = driver.counters()
     driver.close()
-print(json.dumps({"measured": measured, "reconnects": counters.reconnects, "lost": counters.lost}))
+print(json.dumps({"measured": measured, "reconnects": counters.reconnects, "lost": counters.lost, "files": files}))
 """
 
 
@@ -68,7 +76,7 @@ def test_flapping_leaves_nothing_behind(name: str, flaps: int) -> None:
     result = flap(name, flaps)
     first, *_, last = result["measured"][1:]  # caches fill in the first tenth
     assert last[0] <= 1.05 * first[0]
-    assert last[1:] == first[1:]
+    assert last[1:] == first[1:], (result["files"][1], result["files"][-1])
     assert result["reconnects"] >= 0.95 * flaps  # a connection that is cut while it connects is not reconnected
     if name == "modbus":
         assert result["lost"] > 0

@@ -19,7 +19,7 @@ from otolith.site.outlets.process import KeptLines
 from tests.conftest import EXAMPLES
 from tests.messages import assert_says
 from tests.sites.machines import report_of
-from tests.sites.outlets.rigs import PrometheusRig
+from tests.sites.outlets.rigs import MqttRig, PrometheusRig, Rig
 from tests.waiting import wait_for
 
 HEAVY = ("paho", "asyncua", "starlette", "uvicorn", "otolith.site", "smtplib")
@@ -46,11 +46,11 @@ def answer_with_a_fault(connection: Any, _: Any) -> None:
     connection.recv()
 
 
-def machine_file(folder: Path, rig: PrometheusRig) -> Path:
+def machine_file(folder: Path, rig: Rig) -> Path:
     text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
     text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
     file = folder / "machine.toml"
-    file.write_text(f"{text}\n[outlets.prometheus]\n{rig.table()}\n", encoding="utf-8")
+    file.write_text(f"{text}\n[outlets.{rig.name}]\n{rig.table()}\n", encoding="utf-8")
     return file
 
 
@@ -96,6 +96,50 @@ def test_reports_are_passed_on_also_after_the_process_was_killed(
     looking(process, lambda: states() == {identity.name: "OK"})
     process.leave(f"{identity.site}/{identity.name}", is_gone=True)
     wait_for(lambda: rig.states() == {})
+
+
+@pytest.mark.parametrize("removed", ["while it runs", "while it is dead", "before the next one has passed it on"])
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_what_is_gone_is_taken_back_whatever_has_happened_to_the_process(
+    process: OutletProcess, tmp_path: Path, removed: str, is_moved: bool
+) -> None:
+    broker = MqttRig(tmp_path)
+    broker.start()
+    machine = load_machine(machine_file(tmp_path, broker))
+    identity, text = machine.file.machine, machine.path.read_text(encoding="utf-8")
+    key = f"{identity.site}/{identity.name}"
+
+    def kept() -> set[str]:
+        return {topic for topic in broker.retained() if topic.startswith(f"otolith/{key}/") and "status" not in topic}
+
+    def is_passed_on() -> bool:
+        process.offer(report_of(identity.name, None, time.time(), site=identity.site))
+        return f"otolith/{key}/state" in kept()
+
+    try:
+        process.serve(machine)
+        looking(process, is_passed_on)
+        if removed != "while it runs":
+            (child,) = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+            child.kill()
+            wait_for(lambda: child.status() == psutil.STATUS_ZOMBIE)
+        if removed == "before the next one has passed it on":
+            looking(process, lambda: process.child.starts == 2)
+        if is_moved:
+            own = text.replace('host = "127.0.0.1"', 'host = "127.0.0.1"\nprefix = "other"')
+            machine.path.write_text(own, encoding="utf-8")
+            process.serve(load_machine(machine.path))
+        else:
+            process.leave(key, is_gone=True)
+        looking(process, lambda: not kept())
+        if not is_moved:
+            looking(process, lambda: not process.child.alive)
+            starts = process.child.starts
+            process.poll(time.monotonic() + 100.0)
+            assert process.child.starts == starts
+    finally:
+        process.stop(1.0)
+        broker.stop()
 
 
 def test_a_machine_without_outlets_starts_no_process(process: OutletProcess) -> None:

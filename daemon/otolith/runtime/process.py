@@ -195,6 +195,11 @@ class ChildProcess:
         return self._process.is_alive() or (self._inbox is not None and self._inbox.is_open)
 
     @property
+    def has_finished(self) -> bool:
+        """Whether the process has ended by itself, without a fault."""
+        return self._process is not None and self._process.exitcode == 0
+
+    @property
     def deaths(self) -> int:
         """How often in a row the process has ended, or could not be started, before it did its work."""
         return self._pauses.deaths

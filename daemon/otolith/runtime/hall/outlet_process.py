@@ -34,7 +34,8 @@ class OutletProcess:
         self.child = ChildProcess("otolith-outlets", main, OUTLET_ROOM)
         self.dropped = 0  # Reports that no outlet has received
         self._machines: dict[str, MachineOutlets] = {}
-        self._unserved: set[str] = set()  # Those of which outlets tell that nobody serves them
+        self._unserved: dict[str, MachineOutlets] = {}  # Those of which outlets tell that nobody serves them
+        self._before: dict[str, MachineOutlets] = {}  # Tables that a process may not have left yet
         self._changes: dict[str, MachineOutlets | bool] = {}  # That wait for room
         self._is_ending = False
         self._reasons: Mapping[str, str] = {}
@@ -49,16 +50,21 @@ class OutletProcess:
         if not own.table.names:
             self.leave(own.key, is_gone=True)
             return
-        self._unserved.discard(own.key)
+        former = self._unserved.pop(own.key, None) or self._machines.get(own.key)
+        if former is not None and former != own:
+            self._before.setdefault(own.key, former)
         self._machines[own.key] = own
         self.child.widen(OUTLET_ROOM * len(self._machines))
         self._change(own.key, own)
 
     def leave(self, key: str, *, is_gone: bool) -> None:
         """Pass on a machine no longer; ``is_gone`` if its file or its tables were removed."""
-        if self._machines.pop(key, None) is None and key not in self._unserved:
+        if (own := self._machines.pop(key, None) or self._unserved.pop(key, None)) is None:
             return
-        (self._unserved.discard if is_gone else self._unserved.add)(key)
+        if is_gone:
+            self._before.setdefault(key, own)
+        else:
+            self._unserved[key] = own
         self._change(key, is_gone)
 
     def offer(self, document: ReportDocument) -> None:
@@ -77,7 +83,7 @@ class OutletProcess:
 
     def poll(self, now: float) -> None:
         """Read answers, kill it if it hangs or is too large, and start it if it does not run."""
-        if not (self._machines or self.child.alive) or now - self._looked_at < LOOK_PAUSE:
+        if not (self._is_needed or self.child.alive) or now - self._looked_at < LOOK_PAUSE:
             return
         self._looked_at = now
         self._read(now)
@@ -86,12 +92,23 @@ class OutletProcess:
             self._end_without_machines()
             self._supervise(now)
             return
+        if self._is_ending and self.child.has_finished:
+            self._before.clear()
         self.dropped += self._unanswered
         self._unanswered, self._reasons, self._is_ending = 0, {}, False
         self._changes.clear()  # it begins with the machines as they are
-        self._unserved.clear()
-        if self._machines and self.child.may_restart(now):
-            self.child.start(tuple(self._machines.values()))
+        if self._is_needed and self.child.may_restart(now):
+            self.child.start(self._first_messages())
+
+    @property
+    def _is_needed(self) -> bool:
+        return bool(self._machines or self._unserved or self._before)
+
+    def _first_messages(self) -> tuple[tuple[str, MachineOutlets | bool], ...]:
+        """Return what a process begins with: it leaves the tables that one before it may not have left."""
+        served = [(key, own) for part in (self._before, self._unserved, self._machines) for key, own in part.items()]
+        left = [(key, True) for key in self._before if key not in self._machines and key not in self._unserved]
+        return (*served, *left, *((key, False) for key in self._unserved))
 
     def stop(self, seconds: float) -> None:
         """Let it tell for up to ``seconds`` that the daemon ends."""
@@ -127,6 +144,8 @@ class OutletProcess:
         for answer in self.child.replies():
             self._unanswered = max(0, self._unanswered - 1)
             self._effort.begin(now, self.child.processor_time)
+            if not (self._unanswered or self._changes):
+                self._before.clear()
             reasons, lines = answer
             if reasons is not None:
                 self._reasons = reasons

@@ -80,6 +80,7 @@ class DaemonOutlets:
     hindered: Counts = field(default_factory=Counter)
     statuses: list[OutletStatus] = field(default_factory=list)
     _groups: dict[Key, _Group] = field(default_factory=dict)
+    _ending: list[OutletRunner] = field(default_factory=list)  # Of outlets that no machine has any more
     _faults: dict[str, list[str]] = field(default_factory=dict)  # Why outlets of a machine cannot be built
     _said: Mapping[str, str] = field(default_factory=dict)
 
@@ -87,7 +88,7 @@ class DaemonOutlets:
         return self
 
     def __exit__(self, *_: object) -> None:
-        stop(self.runners)
+        stop([*self.runners, *self._ending])
 
     @property
     def runners(self) -> list[OutletRunner]:
@@ -174,10 +175,12 @@ class DaemonOutlets:
             group = self._groups[key]
             with self.lock:
                 group.part.members.discard(machine)
+            group.runner.leave(machine)
             if not group.part.members:
                 del self._groups[key]
                 self.statuses.remove(group.runner.status)
-                threading.Thread(target=group.runner.stop, name="end-outlet", daemon=True).start()
+                group.runner.end()
+                self._ending = [runner for runner in (*self._ending, group.runner) if runner.is_running]
 
 
 def places(machine: MachineOutlets, file: SourceFile) -> dict[str, str]:
@@ -219,15 +222,15 @@ class KeptLines(logging.Handler):
         return tuple(self._kept.popleft() for _ in range(len(self._kept)))
 
 
-def main(connection: Connection, machines: Sequence[MachineOutlets]) -> None:
-    """Pass on what the daemon sends until it ends."""
+def main(connection: Connection, first: Sequence[tuple[str, Any]]) -> None:
+    """Pass on what the daemon sends until it ends; the ``first`` messages are not answered."""
     lines = KeptLines()
     logging.getLogger("otolith").addHandler(lines)
     logging.getLogger("otolith").setLevel(logging.INFO)
     logging.getLogger().setLevel(logging.ERROR)  # libraries tell of each connection that fails
     with DaemonOutlets() as outlets:
-        for machine in machines:
-            outlets.take(machine.key, machine)
+        for message in first:
+            outlets.take(*message)
         while (message := connection.recv()) is not None:
             outlets.take(*message)
             connection.send((outlets.reasons(), lines.taken()))

@@ -34,15 +34,25 @@ class OutletRunner:
         self._pending: deque[Notice] = deque()
         self._dropped = 0
         self._shown: dict[str, tuple[object, ...]] = {}  # Revision of each machine that was passed on
+        self._left: deque[str] = deque()  # Machines that must be taken back, even if another process passed them on
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet-{name}", daemon=True)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has begun and not ended."""
+        return self._thread.is_alive()
 
     def start(self) -> None:
         """Begin."""
         self._thread.start()
 
+    def leave(self, key: str) -> None:
+        """Take back what the other side has of a machine, by its site and name, which is known no longer."""
+        self._left.append(key)
+
     def end(self) -> None:
-        """Begin to end it."""
+        """Begin to end it, once what was left is taken back."""
         self._stopping.set()
 
     def stop(self) -> None:
@@ -53,22 +63,28 @@ class OutletRunner:
     def _run(self) -> None:
         pause = TICK  # s
         while not self._stopping.wait(pause):
-            try:
-                is_tried = self._pass_on()
-            except OutletError as error:
-                self._fail(str(error))
-            except Exception:  # what machines publish ends no outlet
-                log.exception("%s: a fault of its own", self.status.name)
-                self._fail("a fault of its own, see the log")
-            else:
-                if is_tried and not self.status.is_up:
-                    log.info("%s: works", self.status.name)
-                if is_tried:
-                    self.status.is_tried, self.status.is_up, self.status.reason = True, True, ""
-                pause = TICK
-                continue
-            pause = min(2.0 * pause, MAX_PAUSE) if pause > TICK else 2.0 * FIRST_PAUSE
+            longer = min(2.0 * pause, MAX_PAUSE) if pause > TICK else 2.0 * FIRST_PAUSE
+            pause = TICK if self._try() else longer
+        if self._left:
+            self._try()
         self._outlet.close()
+
+    def _try(self) -> bool:
+        """Pass on what has changed, and note whether that works; return False if it does not."""
+        try:
+            is_tried = self._pass_on()
+        except OutletError as error:
+            self._fail(str(error))
+            return False
+        except Exception:  # what machines publish ends no outlet
+            log.exception("%s: a fault of its own", self.status.name)
+            self._fail("a fault of its own, see the log")
+            return False
+        if is_tried and not self.status.is_up:
+            log.info("%s: works", self.status.name)
+        if is_tried:
+            self.status.is_tried, self.status.is_up, self.status.reason = True, True, ""
+        return True
 
     def _fail(self, reason: str) -> None:
         if self.status.is_up or reason != self.status.reason:
@@ -94,6 +110,8 @@ class OutletRunner:
             self._dropped += 1
         self.status.lost, refused = self._dropped + self._limit.withheld, 0
         waiting = len(self._pending)
+        while self._left:
+            self._shown.setdefault(self._left.popleft(), ())
         known = {f"{machine.site}/{machine.name}" for machine in machines}
         gone = [key for key in self._shown if key not in known]
         try:
