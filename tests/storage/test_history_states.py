@@ -1,5 +1,6 @@
 """States of parts over time: what a report announced at an instant is what its history shows there, in any version."""
 
+import contextlib
 import shutil
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -127,6 +128,69 @@ def test_a_history_of_each_version_is_read_and_goes_on_in_place(version: int, tm
     assert reader.latest(1)[0].previous == last
     with sqlite3.connect(path) as connection:
         assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+        assert statements(connection) == statements_of_a_new_one()
+        assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        for table, column in (("report", "time"), ("sample", "mean"), ("event", "time"), ("state", "since")):
+            with pytest.raises(sqlite3.IntegrityError, match="cannot store TEXT"):
+                connection.execute(f"UPDATE {table} SET {column} = 'much'")  # noqa: S608 - our own names
+
+
+def statements(connection: sqlite3.Connection) -> dict[str, str]:
+    """The statements of all tables and indexes by name, each blank as one space."""
+    rows = connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+    return {name: " ".join(text.split()) for name, text in rows}
+
+
+def statements_of_a_new_one() -> dict[str, str]:
+    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
+        create(connection, SITE, MACHINE)
+        return statements(connection)
+
+
+def test_an_upgrade_leaves_out_the_rows_that_the_disk_has_damaged_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    shutil.copy(KEPT_FILES / "4.sqlite", path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE report SET time = x'00' WHERE sequence = (SELECT max(sequence) FROM report)")
+        connection.execute("UPDATE sample SET mean = 'much' WHERE resolution = 60")
+    connection.close()
+    writer = HistoryWriter(path, BOUNDS)
+    _, note = writer.open(START + 100.0)
+    assert note == ""
+    assert len(writer.reader.latest(100)) == 11
+    assert [writer.reader.samples(length, 0.0) == [] for length in (0, MINUTE)] == [False, True]
+    writer._close()
+    assert caplog.text.count("2 rows") == 1
+    assert not list(tmp_path.glob(f"*{KEPT}"))
+
+
+def test_a_table_of_another_type_is_no_history(tmp_path: Path) -> None:
+    path = tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    shutil.copy(KEPT_FILES / "4.sqlite", path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("ALTER TABLE event ADD COLUMN more VARCHAR")
+    connection.close()
+    writer = HistoryWriter(path, BOUNDS)
+    _, note = writer.open(START + 100.0)
+    writer._close()
+    assert "VARCHAR" in note
+    assert len(list(tmp_path.glob(f"*{KEPT}"))) == 1
+
+
+def test_an_sqlite_without_strict_tables_costs_the_history_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    shutil.copy(KEPT_FILES / "4.sqlite", path)
+    content = path.read_bytes()
+    monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 34, 1))
+    writer = HistoryWriter(path, BOUNDS)
+    writer.open(START + 100.0)
+    assert writer._connection is None
+    assert "3.37" in caplog.text
+    assert path.read_bytes() == content
 
 
 def everything(reader: HistoryReader) -> tuple[object, ...]:
