@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache, cached_property
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -132,13 +132,16 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     Nakamura, Biometrika 77, 1990). A direction that mostly noise has determined has hardly any information.
     ``docs/explanation/filter.md`` has the equations.
     """
+    drawn = islice(changes, NOISE_DRAWS)
+    if (first := next(drawn, None)) is None:
+        return root, residual
     size = np.linalg.norm(root, axis=0)
     size[size == 0.0] = np.inf  # a direction without information has no bias
     inverse = np.linalg.pinv(root / size, rcond=MIN_SINGULAR)
     # Sums over the draws: C in all but the last row and column, g in the last column.
     moments, bias = np.zeros((len(size) + 1, len(size) + 1)), np.zeros(len(residual))
     scale, draws = np.concatenate([size, [1.0]]), 0
-    for change in islice(changes, NOISE_DRAWS):
+    for change in chain([first], drawn):
         moments, draws = moments + (change / scale).T @ (change / scale), draws + 1
         bias = inverse.T @ moments[:-1, -1] / draws
         if np.abs(bias).max(initial=0.0) < NEGLIGIBLE_BIAS:
@@ -146,7 +149,7 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     if not np.isfinite(moments).all():
         return root, residual
     # S by its eigenvalues: the share of the information of each direction that is not by the noise.
-    shares, directions = np.linalg.eigh(np.eye(len(bias)) - inverse.T @ moments[:-1, :-1] @ inverse / max(draws, 1))
+    shares, directions = np.linalg.eigh(np.eye(len(bias)) - inverse.T @ moments[:-1, :-1] @ inverse / draws)
     kept = directions[:, shares >= MIN_KEPT_INFORMATION]
     shares = np.where(shares >= MIN_KEPT_INFORMATION, np.minimum(shares, 1.0), INFORMATION_OF_NOISE)
     return (directions * shares) @ directions.T @ root, kept @ (kept.T @ (residual - bias))
