@@ -12,6 +12,7 @@ from pathlib import Path
 import can
 
 from otolith_drivers.base import Driver, Setup, Signal
+from otolith_drivers.canbus import channel as can_channel
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.canbus.options import CanSource
@@ -37,7 +38,7 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
         opened[:] = [bus]
         return bus
 
-    vars(can_receiver).update(open_bus=open_and_remember)
+    vars(can_channel).update(open_bus=open_and_remember)
     signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
     driver = can_receiver.build(
         can_receiver.Options(**options.model_dump(), dbc=Path("dc-motor.dbc")), Setup(signals, EXAMPLES, PERIOD)

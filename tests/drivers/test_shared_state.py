@@ -15,6 +15,7 @@ from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.driver import CanReceiver
 from otolith_drivers.common.message_times import PeriodEstimator
+from otolith_drivers.common.reconnection import Reconnection
 from otolith_drivers.modbus.client import ExceptionReplyError
 from otolith_drivers.opcua import driver as opcua
 from tests.drivers.can_frames import dbc, decoder, frame
@@ -53,7 +54,9 @@ def can_receiver(folder: Path) -> tuple[Driver, Steps]:
     driver = CanReceiver(BusOptions(interface="virtual"), frames)
     messages = [frame(identifier, bytes(8)) for identifier in (256, 257)]
     steps = times_that_come_and_go(lambda at: [frames.decode(message, at) for message in messages], 1e-3)
-    up, down = up_and_down(driver)
+    driver.open(lambda _: None)
+    assert driver._hearing is not None
+    up, down = up_and_down(driver._hearing.channel.connection)
     return driver, (up, up, up, *steps, *steps, down)
 
 
@@ -63,7 +66,7 @@ def mqtt_listener(_: Path) -> tuple[Driver, Steps]:
     take = driver._messages.take
     steps = times_that_come_and_go(lambda at: take("t", b'{"i": 1, "at": %r}' % at, at, retained=False), 1e-3)
     bad = (lambda: take("t", b"nonsense", time.monotonic(), retained=False), lambda: take("t", b"1", 0, retained=True))
-    up, down = up_and_down(driver)
+    up, down = up_and_down(driver._connection)
     return driver, (up, up, *steps, *bad, down)
 
 
@@ -82,7 +85,7 @@ def opcua_subscriber(_: Path) -> tuple[Driver, Steps]:
         message = ua.NotificationMessage(next(numbers), datetime.now(UTC), [])
         readings.take(message, [(0, ua.DataValue(ua.Variant("text"), ua.StatusCode(0)))], time.monotonic())
 
-    up, down = up_and_down(driver)
+    up, down = up_and_down(driver._connection)
     return driver, (up, fault, no_fault, down)
 
 
@@ -108,12 +111,11 @@ def modbus_poller(_: Path) -> tuple[Driver, Steps]:
             requests.answered(request)
             requests.refused(request, ExceptionReplyError(2), next(clock))
 
-    up, connection_down = up_and_down(driver)
+    up, connection_down = up_and_down(driver._connection)
     return driver, (up, fast, down, refused, connection_down)
 
 
-def up_and_down(driver: object) -> Steps:
-    connection = driver._connection  # type: ignore[attr-defined]
+def up_and_down(connection: Reconnection) -> Steps:
     return (lambda: connection.come_up("answers")), (lambda: connection.go_down("the connection was closed"))
 
 
@@ -133,6 +135,7 @@ def test_the_link_is_right_whenever_the_receiving_thread_changes_it(
         assert not any(word in link.plan for word in ("nan", "inf")), link
         assert counters.received >= 0
         assert other.taken
+    driver.close()
 
 
 def test_a_period_that_becomes_unknown_while_it_is_described() -> None:

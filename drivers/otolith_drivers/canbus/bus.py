@@ -17,6 +17,7 @@ from typing import Annotated, Any, Self, TypeVar
 import can
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from otolith_drivers.common.sharing import Place
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import DeviceError, counted, nearest
 from otolith_drivers.units import Quantity
@@ -47,6 +48,7 @@ LISTEN_ONLY: dict[str, dict[str, Any]] = {
 }
 """Arguments of python-can for an interface that shall not acknowledge. For socketcan 'ip link' decides."""
 FILTERING = {"socketcan"}  # Interfaces that get filters: elsewhere they save nothing, or hide error frames
+OPENED_OFTEN = {"socketcan", "udp_multicast", "virtual"}  # Interfaces of which each opening is independent
 STAMPED_BY_KERNEL = {"socketcan", "udp_multicast"}  # Interfaces whose frames have the kernel's times
 WAYS_OUT = {
     "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
@@ -103,6 +105,22 @@ class BusOptions(StrictModel):
         """Whether a frame has its time even if it is read late."""
         return self.resolved()[0] in STAMPED_BY_KERNEL
 
+    def place(self) -> Place:
+        """What identifies the bus on this computer, however it is spelled; with ``fd`` if both kinds can be open."""
+        interface, channel = self.resolved()
+        if interface in OPENED_OFTEN:
+            return "can", interface, channel, self.port if interface == "udp_multicast" else None, self.fd
+        name = channel.partition("@")[0]  # slcan takes the rate of its serial line behind it
+        return "can", interface, str(Path(name).resolve()) if name.startswith("/") else name
+
+    def agreed(self) -> dict[str, object]:
+        """Options in which all must agree who share the bus, as its adapter can be opened only once."""
+        if self.resolved()[0] in OPENED_OFTEN:
+            return {}
+        rate = self.resolved()[1].partition("@")[2] or "as usual"
+        names = ("bitrate", "fd", "data_bitrate", "listen_only")
+        return {"serial rate": rate, **{name: getattr(self, name) for name in names}}
+
     def title(self) -> str:
         """The bus in a few words."""
         interface, channel = self.resolved()
@@ -145,6 +163,12 @@ def open_bus(
         way_out = WAYS_OUT.get(interface, "set driver.interface and driver.channel as python-can's documentation says")
         raise DeviceError(f"CAN bus {options.title()} cannot be opened: {cause}; {way_out}") from error
     return bus
+
+
+def set_filters(bus: can.BusABC, options: BusOptions, filters: list[can.typechecking.CanFilter]) -> None:
+    """Let the kernel pass on other frames than before, if it filters."""
+    if options.resolved()[0] in FILTERING:
+        bus.set_filters(filters)
 
 
 def _receive_only_this_group(bus: can.BusABC) -> None:

@@ -449,6 +449,12 @@ class FrameDecoder:
         is_exact = key in self._readers or key in self._handlers
         return is_exact or (extended and self._groups is not None and self._groups.wants(identifier))
 
+    def hears(self, identifier: int, *, extended: bool) -> bool:
+        """Whether frames of this arbitration ID are of use: decoded, or a sign of a source with another address."""
+        return any(
+            is_extended == extended and not (identifier ^ wanted) & mask for wanted, mask, is_extended in self.filters()
+        )
+
     def describe(self) -> list[str]:
         """What will be read from where, and what is wrong with the files that describe it, a line each."""
         lines = [line for reader in self._readers.values() for line in reader.describe()]

@@ -1,4 +1,4 @@
-"""One connection to a serial line or host for all drivers of this process that read devices on it.
+"""Turns on a connection to a serial line or host that drivers share.
 
 A serial port can be opened once, and many devices accept few connections. The drivers take turns, in the order in which
 they ask, one request each. So each gets a fair rate, and a device that does not answer holds the others up for as long
@@ -11,22 +11,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from otolith_drivers.common.sharing import Place, SharedConnection
+from otolith_drivers.errors import DeviceError
 from otolith_drivers.modbus.client import ConnectionLostError, NoReplyError, ReadOnlyClient
 from otolith_drivers.modbus.options import LineOptions, Table
 
 OWN = frozenset({"pause", "serial", "host", "port"})  # Options of each user; the line is that of _place
 TURN_POLL = 0.05  # s; delay of a stop while a turn is awaited; engineering choice
 
-_lines_lock = threading.Lock()
-_lines: dict[str, "_Line"] = {}  # That are in use
 
-
-class _Line:
+class _Line(SharedConnection["LineUser"]):
     """The connection, and whose turn it is."""
 
-    def __init__(self, place: str, options: LineOptions) -> None:
-        self.place, self.options, self.client, self.is_open = place, options, ReadOnlyClient(options), False
-        self.users: set[LineUser] = set()
+    def __init__(self, options: LineOptions) -> None:
+        super().__init__()
+        self.client, self.is_open = ReadOnlyClient(options), False
         self._lock = threading.Lock()
         self._waiting: deque[threading.Event] = deque()
         self._is_busy = False
@@ -124,46 +123,29 @@ class LineUser:
     def close(self) -> None:
         """Use the connection no longer; the last one closes it. May be called twice."""
         line, self._line = self._line, None
-        if line is None:
-            return
-        with _lines_lock:
-            line.users.discard(self)
-            if line.users:
-                return
-            if _lines.get(line.place) is line:
-                del _lines[line.place]
-            line.close()
+        if line is not None:
+            line.leave(self)
 
     def abort(self) -> None:
         """End a read in progress, or the wait for a turn; callable from another thread."""
         self._cancelled.set()
-        with _lines_lock:
-            if self._line is not None and self._line.users == {self}:  # the read of another one goes on
-                self._line.client.abort()
+        line = self._line
+        if line is not None and line.is_last_use_of(self):  # the read of another one goes on
+            line.client.abort()
 
     def _joined(self) -> _Line:
         """Return the line, of which this driver is a user from now on."""
         if self._line is None:
-            with _lines_lock:
-                place = _place(self._options)
-                line = _lines.setdefault(place, _Line(place, self._options))
-                if differing := _differences(line.options, self._options):
-                    text = f"another machine or source uses this line with other options: {differing}"
-                    raise ConnectionLostError(text)
-                line.users.add(self)
-                self._line = line
+            options = {name: getattr(self._options, name) for name in LineOptions.model_fields if name not in OWN}
+            try:
+                self._line = _Line.join(_place(self._options), self, lambda: _Line(self._options), options)
+            except DeviceError as error:
+                raise ConnectionLostError(str(error)) from error
         return self._line
 
 
-def _place(options: LineOptions) -> str:
+def _place(options: LineOptions) -> Place:
     """Return what identifies the line on this computer, however it is spelled."""
     if options.host is not None:
-        return f"{options.host.lower()}:{options.port}"
-    return str(Path(options.serial or "").resolve())
-
-
-def _differences(there: LineOptions, here: LineOptions) -> str:
-    """Return the options in which the users of a line differ; each may have its own pause, and its own spelling."""
-    names = [name for name in LineOptions.model_fields if name not in OWN]
-    pairs = {name: (getattr(there, name), getattr(here, name)) for name in names}
-    return ", ".join(f"{name} {one} there and {other} here" for name, (one, other) in pairs.items() if one != other)
+        return "modbus", options.host.lower(), options.port
+    return "modbus", str(Path(options.serial or "").resolve())

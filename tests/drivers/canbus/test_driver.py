@@ -71,7 +71,7 @@ def test_frames_of_another_process_arrive_complete(
     bus_options: dict[str, Any], kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for limit in ("MIN_SILENCE", "UNKNOWN_PERIOD_SILENCE"):  # a busy computer starts and ends the process slowly
-        monkeypatch.setattr(f"otolith_drivers.canbus.driver.{limit}", PATIENCE)
+        monkeypatch.setattr(f"otolith_drivers.canbus.channel.{limit}", PATIENCE)
     wishes = RAW if kind == "classic" else {"V_a": ("V", {**RAW["V_a"][1], "fd": True})}
     options = {**bus_options, "fd": kind == "fd", "messages": COUNTED}
     driver, got = receiver(wishes, **options), list[Sample]()

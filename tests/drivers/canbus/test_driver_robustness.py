@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from otolith_drivers.base import Sample
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.driver import CanReceiver, Options, build, monotonic_of
+from otolith_drivers.canbus.channel import monotonic_of
+from otolith_drivers.canbus.driver import CanReceiver, Options, build
 from otolith_drivers.conformance import Rig
 from otolith_drivers.errors import DeviceError
 from tests.conftest import OwnMachine
@@ -98,12 +99,14 @@ def test_frames_of_a_busy_bus_are_gathered_and_keep_their_times(
     own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A frame that cannot be unpacked costs none of the frames that were received together with it."""
-    monkeypatch.setattr("otolith_drivers.canbus.driver.GATHERING_TIME", 0.2)  # a bus of 20 frames/s is busy
+    monkeypatch.setattr("otolith_drivers.canbus.channel.GATHERING_TIME", 0.2)  # a bus of 20 frames/s is busy
     with can_rig(own_machine) as rig, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         samples = opened(rig)
         driver = rig.driver
         assert isinstance(driver, CanReceiver)
-        emit_until(rig, lambda: driver._gathers)
+        hearing = driver._hearing
+        assert hearing is not None
+        emit_until(rig, lambda: hearing.channel._gathers)
         rig.emit()
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         sender.sendto(b"\xc1 no frame", (own_machine.group, own_machine.port))

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from otolith_drivers.base import Setup, Signal
+from otolith_drivers.common.sharing import places
 from otolith_drivers.modbus.driver import Options, Source, build
-from otolith_drivers.modbus.shared_line import _lines
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -76,8 +76,8 @@ def test_two_spellings_of_a_port_are_one_line(tmp_path: Path) -> None:
         (tmp_path / "line").symlink_to(path)
         pumps = [stack.enter_context(pump(str(port), number)) for number, port in ((1, path), (2, tmp_path / "line"))]
         wait_for(lambda: all(len(each.samples) >= 5 for each in pumps))
-        assert len(_lines) == 1
-    assert not _lines
+        assert len(places()) == 1
+    assert not places()
 
 
 def test_twenty_devices_on_a_line_are_read_at_the_same_rate() -> None:
@@ -87,7 +87,7 @@ def test_twenty_devices_on_a_line_are_read_at_the_same_rate() -> None:
         counts = [len(each.samples) for each in pumps]
         assert {sample.value for sample in pumps[4].samples} == {5.0}
     assert max(counts) <= 1.5 * min(counts)
-    assert not _lines
+    assert not places()
 
 
 def test_a_silent_device_is_down_alone_and_holds_the_others_up_for_its_timeouts_only() -> None:
@@ -139,5 +139,5 @@ def test_drives_behind_a_gateway_share_one_connection_and_one_is_silent(drives: 
         read = {n: stack.enter_context(Listener(poller(port, [source(register=0)], device=n))) for n in numbers}
         read[2].wait(lambda link: not link.up and "no device answers" in link.reason)
         wait_for(lambda: all(len(drive.samples) > 5 for number, drive in read.items() if number != 2))
-        assert len(_lines) == 1
+        assert len(places()) == 1
         assert [number for number, drive in read.items() if not drive.driver.link().up] == [2]
