@@ -62,8 +62,9 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
         bus = opened.pop()
         descriptor = bus.fileno()
         os.dup2(no_socket, descriptor)  # the kernel reports from now on that this is no socket
-        if bus.fileno() != descriptor:  # the driver has closed it meanwhile: this one is ours
-            os.close(descriptor)
+        if bus.fileno() != descriptor:  # the driver has closed it meanwhile: this one is ours, or is closed as well
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
 
     try:
         yield driver, flap

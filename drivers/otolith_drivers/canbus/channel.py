@@ -10,7 +10,7 @@ import time
 
 import can
 
-from otolith_drivers.base import Deliver, Sample
+from otolith_drivers.base import Sample
 from otolith_drivers.canbus.bus import (
     MAX_CONSECUTIVE_BAD,
     BusOptions,
@@ -24,8 +24,8 @@ from otolith_drivers.canbus.bus import (
 )
 from otolith_drivers.canbus.decoder import EXTENDED, FrameDecoder
 from otolith_drivers.common.clocks import wall_clock_offset
-from otolith_drivers.common.reconnection import CLOSE_TIMEOUT, OwnFaults, PassingFault, Reconnection, ThreadedDriver
-from otolith_drivers.common.sharing import SharedConnection
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver
+from otolith_drivers.common.sharing import Delivery, SharedConnection
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -43,12 +43,10 @@ MAX_ROUTES = 4096  # identifiers of which it is known who decodes them; a bus of
 class CanListener:
     """What one driver hears of a channel."""
 
-    def __init__(self, decoder: FrameDecoder, deliver: Deliver) -> None:
-        self.decoder = decoder
+    def __init__(self, decoder: FrameDecoder, delivery: Delivery) -> None:
+        self.decoder, self.delivery = decoder, delivery
         self.frames = 0  # That it was given
-        self.own_faults = OwnFaults(log)
-        self._deliver, self._samples, self._has_left = deliver, list[Sample](), False
-        self._delivering = threading.Lock()
+        self._samples = list[Sample]()
 
     def hear(self, frame: can.Message, time: float) -> None:
         """Take a frame of ``time`` (s)."""
@@ -57,22 +55,8 @@ class CanListener:
 
     def hand_over(self) -> None:
         """Deliver the samples of the frames since the last call."""
-        if not self._samples:
-            return
         samples, self._samples = self._samples, []
-        with self._delivering:
-            if self._has_left:
-                return
-            try:
-                self._deliver(samples)
-            except Exception as error:  # noqa: BLE001 - nothing of one machine may end the thread of all
-                self.own_faults.note(error, f"delivering {len(samples)} samples", time.monotonic())
-
-    def leave(self) -> None:
-        """Deliver nothing any more, from now on."""
-        self._has_left = True
-        if self._delivering.acquire(timeout=CLOSE_TIMEOUT):
-            self._delivering.release()
+        self.delivery.hand_over(samples)
 
 
 class CanChannel(ThreadedDriver, SharedConnection[CanListener]):

@@ -14,6 +14,7 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.channel import CanChannel, CanListener, silence_limit
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import CanSource, FrameOptions
+from otolith_drivers.common.sharing import Delivery
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ class CanReceiver:
         self._hearing: _Hearing | None = None
 
     def open(self, deliver: Deliver) -> None:
-        listener = CanListener(self._decoder, deliver)
+        listener = CanListener(self._decoder, Delivery(deliver, log))
         place, options = self._options.place(), self._options.agreed()
         channel = CanChannel.join(place, listener, lambda: CanChannel(self._options), options)
         try:
@@ -74,7 +75,7 @@ class CanReceiver:
 
     def close(self) -> None:
         if self._hearing is not None:
-            self._hearing.listener.leave()
+            self._hearing.listener.delivery.end()
             self._hearing.channel.leave(self._hearing.listener)
 
     def counters(self) -> Counters:
@@ -103,7 +104,7 @@ class CanReceiver:
         silent = [f"no frame at all for {silence:.1f} s"] if silence > silence_limit(self._decoder) else []
         unreadable = channel.unreadable.warnings(now)
         warnings = (*silent, *unreadable, *channel.drops.warnings(now), *self._decoder.warnings(now))
-        defects = (self._decoder.defect(now), listener.own_faults.defect(now), channel.own_faults.defect(now))
+        defects = (self._decoder.defect(now), listener.delivery.defect(now), channel.own_faults.defect(now))
         defect = "; ".join(filter(None, defects))
         return Link(up=True, warnings=warnings, latency=self._decoder.latency, defect=defect)
 

@@ -6,11 +6,14 @@ times, everything by which two connections would differ belongs to it, so that a
 own. If it can be opened only once, the drivers must agree on the options.
 """
 
+import logging
 import threading
-from collections.abc import Callable, Hashable, Mapping
+import time
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Generic, Self, TypeVar
 
-from otolith_drivers.common.reconnection import CLOSE_TIMEOUT
+from otolith_drivers.base import Deliver, Sample
+from otolith_drivers.common.reconnection import CLOSE_TIMEOUT, OwnFaults
 from otolith_drivers.errors import DeviceError
 
 Place = tuple[Hashable, ...]  # Begins with the name of the driver
@@ -82,6 +85,36 @@ class SharedConnection(Generic[User]):
     def close(self) -> None:
         """Close the connection within a second: nobody uses it any more."""
         raise NotImplementedError
+
+
+class Delivery:
+    """Where the samples of one user go, until it leaves; nothing that this does reaches the other users."""
+
+    def __init__(self, deliver: Deliver, log: logging.Logger) -> None:
+        self._deliver, self._own_faults, self._has_ended = deliver, OwnFaults(log), False
+        self._delivering = threading.Lock()
+
+    def hand_over(self, samples: Sequence[Sample]) -> None:
+        """Deliver ``samples``, if there are any."""
+        if not samples:
+            return
+        with self._delivering:
+            if self._has_ended:
+                return
+            try:
+                self._deliver(samples)
+            except Exception as error:  # noqa: BLE001 - the thread serves all users
+                self._own_faults.note(error, f"delivering {len(samples)} samples", time.monotonic())
+
+    def end(self) -> None:
+        """Deliver nothing from now on; waits for a delivery that is under way, but not for long."""
+        self._has_ended = True
+        if self._delivering.acquire(timeout=CLOSE_TIMEOUT):
+            self._delivering.release()
+
+    def defect(self, now: float) -> str:
+        """Return what went wrong lately at ``now`` (s); empty if nothing."""
+        return self._own_faults.defect(now)
 
 
 def places() -> list[Place]:

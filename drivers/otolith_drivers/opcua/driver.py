@@ -21,25 +21,23 @@ from asyncua import Client, ua
 from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, Setup, Signal
 from otolith_drivers.common.clocks import wall_clock_offset
 from otolith_drivers.common.message_times import ExchangeClock, PeriodEstimator, unix_time
-from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection, ThreadedDriver
+from otolith_drivers.common.reconnection import OwnFaults, PassingFault, Reconnection
+from otolith_drivers.common.sharing import Delivery
 from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
     OpcuaOptions,
     OpcuaSource,
     RefusedError,
-    connected,
-    exchange,
     namespaces,
     place,
     reason,
     unit_of,
 )
+from otolith_drivers.opcua.session import EXPECTED, OpcuaSession
 
 log = logging.getLogger(__name__)
 
-FIRST_EXCHANGES = 5  # questions for the server's time before the first value is used
-EXCHANGE_PERIOD = 2.0  # s between two such questions later on
 SILENT_INTERVALS, MIN_SILENCE = 20.0, 2.0  # messages; s: without one, the connection is opened anew
 KEEPALIVE = 1  # intervals without a value, after which the server sends an empty message
 QUEUE_MARGIN = 4  # messages that the server's queue of a variable can hold back
@@ -47,7 +45,6 @@ HOLD_INTERVALS = 5.0  # messages without a change, after which a value is repeat
 MAX_AGE = 5.0  # s between the stamp of a value and its message; more is another clock, or a time zone
 FIRST_RETRY, LAST_RETRY = 2.0, 60.0  # s, doubled from one to the other: when missing variables are asked for again
 GONE = (ua.StatusCodes.BadNodeIdUnknown, ua.StatusCodes.BadNodeIdInvalid)  # of a variable that the server has removed
-EXPECTED = (OSError, TimeoutError, asyncio.CancelledError, ua.UaError, RefusedError)  # What ends a session
 OVERFLOW = 0x480  # info bits of a status: of a data value, values before it were dropped (Part 4, 7.39.1)
 
 
@@ -199,34 +196,30 @@ def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
     return OpcuaSubscriber(options, credentials, readings, setup.sample_period)
 
 
-class OpcuaSubscriber(ThreadedDriver):
-    """Implements :class:`otolith_drivers.base.Driver` over asyncua, with a thread that runs its event loop."""
+class OpcuaSubscriber:
+    """Implements :class:`otolith_drivers.base.Driver` over asyncua, with a session that drivers share."""
 
     sampling = Sampling.POLLED
 
     def __init__(self, options: OpcuaOptions, credentials: OpcUaCredentials, readings: Readings, period: float) -> None:
-        super().__init__()
         self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
         self._connection = Reconnection(f"OPC UA {options.endpoint}", log)
-        self._own_faults = OwnFaults(log)
-        self._latest = -math.inf  # s; time of the latest message
-        self._slow = ""  # what the server grants less than was asked
-        self._ended = ""  # why the subscription has ended
-        self._certificate_warnings: list[str] = []
-        self._interval = options.interval  # s between two messages
-        self._clocks_due = 0.0  # s; when they are compared again
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._subscription: _Subscription | None = None
+        self._session: OpcuaSession | None = None
 
     def open(self, deliver: Deliver) -> None:
-        self._connection.stay_down("not connected yet")
-        self._start("opcua-subscribe", lambda: asyncio.run(self._run(deliver)))
+        delivery = Delivery(deliver, log)
+        subscription = _Subscription(self._options, self._readings, self._period, self._connection, delivery)
+        place = OpcuaSession.place(self._options, self._credentials)
+        session = OpcuaSession.join(place, subscription, lambda: OpcuaSession(self._options, self._credentials))
+        self._subscription, self._session, self._readings.clock = subscription, session, session.clock
+        self._connection.stay_down(session.cause)
+        session.open()
 
     def close(self) -> None:
-        self._stop.set()
-        if self._loop is not None and self._task is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._task.cancel)
-        super().close()
+        if self._subscription is not None and self._session is not None:
+            self._subscription.delivery.end()
+            self._session.leave(self._subscription)
 
     def counters(self) -> Counters:
         readings = self._readings
@@ -234,7 +227,9 @@ class OpcuaSubscriber(ThreadedDriver):
 
     def link(self) -> Link:
         readings, now, (up, reason) = self._readings, time.monotonic(), self._connection.state
-        lines = self._certificate_warnings + [line for node in readings.signals for line in node.warnings(now)]
+        subscription, session = self._subscription, self._session
+        lines = [*session.certificate_warnings] if session is not None else []
+        lines += [line for node in readings.signals for line in node.warnings(now)]
         if readings.server_stamped:
             lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
         plan = ""
@@ -244,10 +239,14 @@ class OpcuaSubscriber(ThreadedDriver):
             bound = f"{1e3 * readings.clock.error:.2g} ms"
             plan = f"the server's clock is {abs(ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
-            plan += f", {self._slow}" if self._slow else ""
-        changed = dict.fromkeys(node.defect for node in readings.signals)
-        defect = "; ".join(filter(None, [*changed, self._own_faults.defect(now)]))
-        return Link(up, reason, tuple(lines) if up else (), plan, latency=self._interval, defect=defect)
+            plan += f", {subscription.slow}" if subscription is not None and subscription.slow else ""
+        defects = [node.defect for node in readings.signals]
+        if subscription is not None and session is not None:
+            defects += [subscription.own_faults.defect(now), subscription.delivery.defect(now)]
+            defects.append(session.own_faults.defect(now))
+        defect = "; ".join(filter(None, dict.fromkeys(defects)))
+        latency = self._options.interval if subscription is None else subscription.interval
+        return Link(up, reason, tuple(lines) if up else (), plan, latency=latency, defect=defect)
 
     def describe(self) -> list[str]:
         nodes = [
@@ -257,53 +256,55 @@ class OpcuaSubscriber(ThreadedDriver):
         ]
         return [*self._options.describe(), *nodes]
 
-    async def _run(self, deliver: Deliver) -> None:
-        self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
-        while not self._stop.is_set():
+
+class _Subscription:
+    """Implements :class:`Subscriber`: the subscription of one driver, in the event loop of the session."""
+
+    def __init__(
+        self, options: OpcuaOptions, readings: Readings, period: float, connection: Reconnection, delivery: Delivery
+    ) -> None:
+        self.delivery, self.own_faults = delivery, OwnFaults(log)
+        self.slow = ""  # what the server grants less than was asked
+        self.interval = options.interval  # s between two messages
+        self._options, self._readings, self._period, self._connection = options, readings, period, connection
+        self._latest = -math.inf  # s; time of the latest message
+        self._ended = ""  # why the subscription has ended
+
+    def lose(self, cause: str) -> None:
+        self._connection.go_down(cause)
+
+    async def serve(self, session: OpcuaSession, client: Client) -> None:
+        self._connection.backoff.reset()
+        while True:
             try:
-                await self._session(deliver)
-            except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - nothing may end the thread
-                if self._stop.is_set():
-                    return
-                if not isinstance(error, EXPECTED):
-                    self._own_faults.note(error, "a session with the server", time.monotonic())
-                self._connection.go_down(reason(error, self._options.timeout))
-            try:
-                await asyncio.sleep(self._connection.backoff.next())
+                await self._serve(session, client)
             except asyncio.CancelledError:
-                return
+                raise
+            except Exception as error:  # noqa: BLE001 - nothing of one machine may end the session of others
+                if not isinstance(error, EXPECTED):
+                    self.own_faults.note(error, "a subscription", time.monotonic())
+                if session.holds(client):
+                    self._connection.go_down(reason(error, self._options.timeout))
+                    session.doubt()
+            await asyncio.sleep(self._connection.backoff.next())
 
-    async def _session(self, deliver: Deliver) -> None:
-        """Subscribe and take values until the connection fails, which raises."""
-        async with connected(self._options, self._credentials) as (client, self._certificate_warnings):
-            client.connection_lost_callback = self._note_loss
-            for _ in range(FIRST_EXCHANGES):
-                await self._compare_clocks(client)
-            await self._look_up(client, self._readings.signals)
-            subscription, interval = await self._subscribe(client, deliver)
-            retry, pause = time.monotonic() + FIRST_RETRY, FIRST_RETRY
-            limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
-            while True:
-                await asyncio.sleep(0.1 * limit)
-                now = time.monotonic()
-                if self._ended:
-                    raise ConnectionError(self._ended)
-                if now - self._latest > limit:
-                    raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
-                if now >= self._clocks_due:
-                    await self._compare_clocks(client)
-                if now >= retry:
-                    found = await self._ask_again(client, subscription)
-                    pause = FIRST_RETRY if found else min(2.0 * pause, LAST_RETRY)
-                    retry = now + pause
-
-    async def _note_loss(self, error: Exception) -> None:
-        """Take the cause from the library, which after this presents a lost connection as an ended subscription."""
-        self._ended = "the server does not answer" if isinstance(error, TimeoutError) else "the connection was closed"
-
-    async def _compare_clocks(self, client: Client) -> None:
-        await exchange(client, self._readings.clock)
-        self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
+    async def _serve(self, session: OpcuaSession, client: Client) -> None:
+        """Subscribe and take values until the subscription fails, which raises."""
+        await self._look_up(client, self._readings.signals)
+        subscription, interval = await self._subscribe(session, client)
+        retry, pause = time.monotonic() + FIRST_RETRY, FIRST_RETRY
+        limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
+        while True:
+            await asyncio.sleep(0.1 * limit)
+            now = time.monotonic()
+            if self._ended:
+                raise ConnectionError(self._ended)
+            if now - self._latest > limit:
+                raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
+            if now >= retry:
+                found = await self._ask_again(client, subscription)
+                pause = FIRST_RETRY if found else min(2.0 * pause, LAST_RETRY)
+                retry = now + pause
 
     async def _look_up(self, client: Client, nodes: Sequence[NodeSignal]) -> None:
         """Ask for the variables, and for the units that the machine file leaves out."""
@@ -341,18 +342,18 @@ class OpcuaSubscriber(ThreadedDriver):
         )
         return not all(node.fault for node in nodes)
 
-    async def _subscribe(self, client: Client, deliver: Deliver) -> tuple[int, float]:
+    async def _subscribe(self, session: OpcuaSession, client: Client) -> tuple[int, float]:
         """Subscribe to all variables; return the subscription and the time (s) between two messages."""
-        readings, session = self._readings, client.uaclient.session
+        readings = self._readings
         asked = ua.CreateSubscriptionParameters(
             RequestedPublishingInterval=self._options.interval * 1e3,
             RequestedLifetimeCount=10_000,
             RequestedMaxKeepAliveCount=KEEPALIVE,
         )
         readings.begin(self._options.interval)
-        self._latest, self._ended, self._slow = time.monotonic(), "", ""
-        result = await session.create_subscription(asked, lambda message: self._guarded_take(message, deliver))
-        interval = self._interval = 1e-3 * float(result.RevisedPublishingInterval)
+        self._latest, self._ended, self.slow = time.monotonic(), "", ""
+        result = await session.subscribe(client, self, asked, lambda message: self._guarded_take(message, session))
+        interval = self.interval = 1e-3 * float(result.RevisedPublishingInterval)
         readings.begin(interval)
         for node in readings.signals:
             node.item = None
@@ -388,7 +389,7 @@ class OpcuaSubscriber(ThreadedDriver):
                 node.fault = f"{node.source.node}: {result.StatusCode.name}: {hint}; it is asked for again"
             elif result.RevisedSamplingInterval > 1.5e3 * self._period:
                 rates = f"every {result.RevisedSamplingInterval:g} ms instead of {self._period * 1e3:g} ms"
-                self._slow = f"by its own account the server samples {node.signal.name} {rates}"
+                self.slow = f"by its own account the server samples {node.signal.name} {rates}"
         return refused
 
     def _item(self, node: NodeSignal, index: int, *, by_stamp: bool) -> ua.MonitoredItemCreateRequest:
@@ -406,13 +407,13 @@ class OpcuaSubscriber(ThreadedDriver):
             ItemToMonitor=where, MonitoringMode=ua.MonitoringMode.Reporting, RequestedParameters=parameters
         )
 
-    def _guarded_take(self, result: ua.PublishResult, deliver: Deliver) -> None:
+    def _guarded_take(self, result: ua.PublishResult, session: OpcuaSession) -> None:
         try:
-            self._take(result, deliver)
+            self._take(result, session)
         except Exception as error:  # noqa: BLE001 - the library would drop it without a word
-            self._own_faults.note(error, "reading a message of the server", time.monotonic())
+            self.own_faults.note(error, "reading a message of the server", time.monotonic())
 
-    def _take(self, result: ua.PublishResult, deliver: Deliver) -> None:
+    def _take(self, result: ua.PublishResult, session: OpcuaSession) -> None:
         """Take a message of the subscription; called in the event loop."""
         now = self._latest = time.monotonic()
         message, readings = result.NotificationMessage, self._readings
@@ -423,15 +424,12 @@ class OpcuaSubscriber(ThreadedDriver):
             elif isinstance(part, ua.DataChangeNotification):
                 values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
         if not readings.clock.arrival(unix_time(message.PublishTime), now):  # the server's clock was set
-            self._clocks_due = now
+            session.doubt()
         for index, value in values:
             if value.StatusCode is not None and value.StatusCode.value in GONE:
                 node = readings.signals[index]
                 node.fault = f"{node.source.node}: the server has removed it; it is asked for again"
         samples = readings.take(message, values, now)
-        if self._stop.is_set():
-            return
         if values:  # also unusable ones: what is wrong with them is a warning of a link that is up
             self._connection.come_up("sends values")
-        if samples:
-            deliver(samples)
+        self.delivery.hand_over(samples)
