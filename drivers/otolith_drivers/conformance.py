@@ -6,14 +6,15 @@
             check(rig)
 
 Each check takes a rig with a driver that is not open, opens and closes it, and raises ``AssertionError`` with the
-violated rule. See docs/your-own-driver.md.
+violated rule. A driver that shares connections has further checks, ``SHARING``, which take a rig of several drivers.
+See docs/your-own-driver.md.
 """
 
 import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
@@ -128,6 +129,95 @@ CONTRACT: tuple[Callable[[Rig], None], ...] = (
     description_names_all_signals,
     public_names_are_those_of_the_protocol,
 )
+
+
+@dataclass(frozen=True)
+class SharedRig:
+    """Drivers of several machines at one place, none of them open, as a driver sees them that shares connections."""
+
+    rigs: Sequence[Rig]
+    connections: Callable[[], int]  # How many there are now, as the other end or the operating system counts them
+
+
+def machines_at_a_place_have_one_connection(rig: SharedRig) -> None:
+    """There is one connection while any driver is open, each gets what is its own, and the last one closes it."""
+    before = rig.connections()
+    with ExitStack() as stack:
+        opened = [stack.enter_context(_opened(each)) for each in rig.rigs]
+        _require(rig.connections() - before == 1, f"{rig.connections() - before} connections instead of 1")
+        for each, samples in zip(rig.rigs, opened, strict=True):
+            wrong = {sample.signal for sample in samples} - set(each.expected)
+            _require(not wrong, f"samples of another machine: {sorted(wrong)}")
+            values = {
+                sample.value for sample in samples if not math.isclose(sample.value, each.expected[sample.signal])
+            }
+            _require(not values, f"values of another machine: {sorted(values)[:5]}")
+            _require(_harm(each) == (0, 0), f"bad samples and reconnections of a healthy machine: {_harm(each)}")
+    _wait(lambda: rig.connections() == before, "the connection is open after the last driver has closed")
+
+
+def one_that_comes_or_leaves_disturbs_no_other(rig: SharedRig) -> None:
+    """While others open and close, the samples of a machine go on, and no reconnection is counted."""
+    staying, *others = rig.rigs
+    with _opened(staying) as samples:
+        for other in others:
+            with _opened(other):
+                pass
+            _go_on(staying, samples, f"after {other.driver.describe()[0]!r} has closed")
+        _require(_harm(staying) == (0, 0), f"bad samples and reconnections of one that stayed: {_harm(staying)}")
+
+
+def one_whose_samples_are_refused_harms_no_other(rig: SharedRig) -> None:
+    """What delivering to one machine raises reaches no other one, and is a defect of that one alone."""
+    hostile, *others = rig.rigs
+
+    def refuse(_: Sequence[Sample]) -> None:
+        raise ArithmeticError("no room")
+
+    hostile.driver.open(refuse)
+    try:
+        with ExitStack() as stack:
+            for other in others:
+                samples = stack.enter_context(_opened(other))
+                for _ in range(3):
+                    hostile.emit()
+                _go_on(other, samples, "while another machine refuses its own")
+                _require(_harm(other) == (0, 0), f"bad samples and reconnections: {_harm(other)}")
+                _require(not other.driver.link().defect, f"the defect of another machine: {other.driver.link().defect}")
+            _wait(lambda: bool(hostile.driver.link().defect), "the machine that refuses its samples has no defect")
+    finally:
+        hostile.driver.close()
+
+
+SHARING: tuple[Callable[[SharedRig], None], ...] = (
+    machines_at_a_place_have_one_connection,
+    one_that_comes_or_leaves_disturbs_no_other,
+    one_whose_samples_are_refused_harms_no_other,
+)
+
+
+def _harm(rig: Rig) -> tuple[int, int]:
+    """Return bad samples and reconnections; a busy computer also loses samples."""
+    counters = rig.driver.counters()
+    return counters.bad, counters.reconnects
+
+
+def _go_on(rig: Rig, samples: Sequence[Sample], when: str) -> None:
+    """Require that samples come that have not come yet."""
+    before = len(samples)
+
+    def came() -> bool:
+        rig.emit()
+        return len(samples) >= before + 3
+
+    _wait(came, f"no samples {when}: {rig.driver.link()}")
+
+
+def _wait(condition: Callable[[], bool], rule: str) -> None:
+    deadline = time.monotonic() + SAMPLES_TIMEOUT
+    while not condition():
+        _require(time.monotonic() < deadline, rule)
+        time.sleep(0.005)
 
 
 @contextmanager

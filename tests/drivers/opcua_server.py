@@ -121,9 +121,13 @@ def opcua_server(port: int, values: dict[str, tuple[float, str]], *arguments: st
 @cache
 def server_of_this_process() -> int:
     """The port of a server that ends with this process."""
+    return lasting_server(i=(2.0, "A"), omega=(10.0, ""), still=(3.0, "A"), ahead=(4.0, "A"), bad=(math.nan, "A"))
+
+
+def lasting_server(**values: tuple[float, str]) -> int:
+    """The port of a new server that ends with this process."""
     port, stack = free_port(socket.SOCK_STREAM), ExitStack()
-    variables = {"i": (2.0, "A"), "omega": (10.0, ""), "still": (3.0, "A"), "ahead": (4.0, "A"), "bad": (math.nan, "A")}
-    stack.enter_context(opcua_server(port, variables))
+    stack.enter_context(opcua_server(port, values))
     atexit.register(stack.close)
     return port
 

@@ -86,6 +86,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
         self._stop.set()
         if self._task is not None:
             self._call(self._task.cancel)
+        self.users_changed()
         super().close()
 
     def users_changed(self) -> None:
@@ -141,6 +142,8 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
                 self._lose(reason(error, self._options.timeout))
             if time.monotonic() - begun >= LASTING:
                 backoff.reset()
+            if self._stop.is_set():
+                return
             try:
                 await asyncio.sleep(backoff.next())
             except asyncio.CancelledError:
@@ -158,10 +161,10 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
             self._lost = ""
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
-            self._subscriptions, self._takers = {}, {}
+            self._subscriptions, self._takers, self.cause = {}, {}, "not connected yet"
             serving, publishing = dict[Subscriber, asyncio.Task[None]](), list[asyncio.Task[None]]()
             try:
-                while True:
+                while not self._stop.is_set():  # a cancellation may be swallowed by the library
                     await self._serve_users(client, serving)
                     for _ in range(len(publishing) + 1, min(len(serving), MAX_PUBLISHING)):
                         publishing.append(asyncio.create_task(self._publish(client)))
