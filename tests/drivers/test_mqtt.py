@@ -72,6 +72,20 @@ def test_a_retained_value_is_no_sample_and_damaged_messages_are_counted() -> Non
     assert samples[0].value == pytest.approx(2.0)
 
 
+def test_a_machine_loses_nothing_while_the_topic_of_another_one_is_flooded() -> None:
+    """Each has a client, and the broker a queue for each client: in one of both, the quiet one would lose messages."""
+    port, count = broker_of_this_process(), 50
+    flooded, quiet = (setup_of(i={"topic": f"flood/{name}", "unit": "A"}) for name in ("fast", "quiet"))
+    with opened(port, flooded) as (fast, _), opened(port, quiet) as (slow, samples), publisher(port) as client:
+        wait_for(lambda: fast.link().up and slow.link().up)
+        for number in range(count):
+            for _ in range(400):
+                client.publish("flood/fast", "1" + " " * 1000)
+            client.publish("flood/quiet", str(number))
+        wait_for(lambda: len(samples) == count)
+    assert [sample.value for sample in samples] == list(range(count))
+
+
 def test_a_broker_that_is_killed_and_comes_back_costs_counted_samples(tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
     keys = {"time": "t", "time_format": "s"}

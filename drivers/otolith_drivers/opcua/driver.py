@@ -258,7 +258,7 @@ class OpcuaSubscriber:
 
 
 class _Subscription:
-    """Implements :class:`Subscriber`: the subscription of one driver, in the event loop of the session."""
+    """Implements :class:`.session.SessionUser`: the subscription of one driver, in the event loop of the session."""
 
     def __init__(
         self, options: OpcuaOptions, readings: Readings, period: float, connection: Reconnection, delivery: Delivery

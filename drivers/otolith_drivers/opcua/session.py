@@ -38,7 +38,7 @@ EXPECTED = (OSError, TimeoutError, asyncio.CancelledError, ua.UaError, RefusedEr
 Take = Callable[[ua.PublishResult], None]
 
 
-class Subscriber(Protocol):
+class SessionUser(Protocol):
     """A user of a session; both are called in its event loop."""
 
     async def serve(self, session: "OpcuaSession", client: Client) -> None:
@@ -48,7 +48,7 @@ class Subscriber(Protocol):
         """Note why there is no session."""
 
 
-class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
+class OpcuaSession(ThreadedDriver, SharedConnection[SessionUser]):
     """The session, in a thread that runs its event loop, and connects again after every fault."""
 
     def __init__(self, options: OpcuaOptions, credentials: OpcUaCredentials) -> None:
@@ -59,7 +59,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
         self.cause = "not connected yet"  # Why there is no session
         self.own_faults = OwnFaults(log)
         self._options, self._credentials = options, credentials
-        self._subscriptions: dict[Subscriber, int] = {}
+        self._subscriptions: dict[SessionUser, int] = {}
         self._takers: dict[int, Take] = {}  # Who takes the messages of a subscription
         self._lost = ""  # why the library has lost the connection
         self._clocks_due = 0.0  # s; when they are compared again
@@ -95,7 +95,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
             self._call(self._news.set)
 
     async def subscribe(
-        self, client: Client, user: Subscriber, asked: ua.CreateSubscriptionParameters, take: Take
+        self, client: Client, user: SessionUser, asked: ua.CreateSubscriptionParameters, take: Take
     ) -> ua.CreateSubscriptionResult:
         """Create the subscription of ``user`` instead of the one that it had; ``take`` takes its messages."""
         await self._unsubscribe(client, user)
@@ -104,7 +104,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
         self._takers[int(result.SubscriptionId)] = take
         return result
 
-    async def _unsubscribe(self, client: Client, user: Subscriber) -> None:
+    async def _unsubscribe(self, client: Client, user: SessionUser) -> None:
         number = self._subscriptions.pop(user, None)
         if number is not None:
             self._takers.pop(number, None)
@@ -162,7 +162,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
             self._subscriptions, self._takers, self.cause = {}, {}, "not connected yet"
-            serving, publishing = dict[Subscriber, asyncio.Task[None]](), list[asyncio.Task[None]]()
+            serving, publishing = dict[SessionUser, asyncio.Task[None]](), list[asyncio.Task[None]]()
             try:
                 while not self._stop.is_set():  # a cancellation may be swallowed by the library
                     await self._serve_users(client, serving)
@@ -172,7 +172,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[Subscriber]):
             finally:
                 await _end([*serving.values(), *publishing])
 
-    async def _serve_users(self, client: Client, serving: dict[Subscriber, "asyncio.Task[None]"]) -> None:
+    async def _serve_users(self, client: Client, serving: dict[SessionUser, "asyncio.Task[None]"]) -> None:
         """Begin to serve users who have come, and end it for those who have left."""
         users = self.users
         for user in [user for user in serving if user not in users]:
