@@ -238,6 +238,18 @@ async def exchange(client: Client, clock: ExchangeClock) -> None:
     clock.exchange(sent, unix_time(response.ResponseHeader.Timestamp), received)
 
 
+async def next_message(client: Client, received: list[ua.SubscriptionAcknowledgement]) -> ua.PublishResult:
+    """Wait for the next message of any subscription, and confirm those ``received`` (Part 4, 5.14.5: Publish)."""
+    protocol = client.uaclient.protocol
+    if protocol is None:
+        raise ConnectionError("the connection was closed")
+    request = ua.PublishRequest()
+    request.Parameters.SubscriptionAcknowledgements = received
+    data = await protocol.send_request(request, timeout=0)
+    result: ua.PublishResult = struct_from_binary(ua.PublishResponse, data).Parameters
+    return result
+
+
 async def namespaces(client: Client) -> list[str]:
     """Return the URIs of the server's namespaces, in their order of this session; empty if it does not tell them."""
     try:

@@ -24,6 +24,7 @@ from otolith_drivers.opcua.connection import (
     RefusedError,
     connected,
     exchange,
+    next_message,
     reason,
 )
 
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 
 FIRST_EXCHANGES = 5  # questions for the server's time before the first value is used
 EXCHANGE_PERIOD = 2.0  # s between two such questions later on
-MAX_PUBLISHING = 5  # requests for messages that wait at the server at most
+MAX_ASKING = 5  # requests for messages that wait at the server at most
 REFUSED_PAUSE = 1.0  # s until a request for messages is repeated that the server has refused
 DEFAULT_PORT = 4840
 EXPECTED = (OSError, TimeoutError, asyncio.CancelledError, ua.UaError, RefusedError)  # What ends a session
@@ -162,15 +163,15 @@ class OpcuaSession(ThreadedDriver, SharedConnection[SessionUser]):
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
             self._subscriptions, self._takers, self.cause = {}, {}, "not connected yet"
-            serving, publishing = dict[SessionUser, asyncio.Task[None]](), list[asyncio.Task[None]]()
+            serving, asking = dict[SessionUser, asyncio.Task[None]](), list[asyncio.Task[None]]()
             try:
                 while not self._stop.is_set():  # a cancellation may be swallowed by the library
                     await self._serve_users(client, serving)
-                    for _ in range(len(publishing) + 1, min(len(serving), MAX_PUBLISHING)):
-                        publishing.append(asyncio.create_task(self._publish(client)))
+                    for _ in range(len(asking) + 1, min(len(serving), MAX_ASKING)):
+                        asking.append(asyncio.create_task(self._ask_for_messages(client)))
                     await self._wait(client)
             finally:
-                await _end([*serving.values(), *publishing])
+                await _end([*serving.values(), *asking])
 
     async def _serve_users(self, client: Client, serving: dict[SessionUser, "asyncio.Task[None]"]) -> None:
         """Begin to serve users who have come, and end it for those who have left."""
@@ -193,7 +194,7 @@ class OpcuaSession(ThreadedDriver, SharedConnection[SessionUser]):
         if time.monotonic() >= self._clocks_due:
             await self._compare_clocks(client)
 
-    async def _publish(self, client: Client) -> None:
+    async def _ask_for_messages(self, client: Client) -> None:
         """Ask for messages beside the library, which has one request at the server for all subscriptions.
 
         With one only, the time to the server and back would limit how many messages all machines get together.
@@ -201,12 +202,14 @@ class OpcuaSession(ThreadedDriver, SharedConnection[SessionUser]):
         received: list[ua.SubscriptionAcknowledgement] = []
         while True:
             try:
-                response = await client.uaclient.session.publish(received)
-            except (ua.UaError, OSError):
+                result = await next_message(client, received)
+            except Exception as error:  # noqa: BLE001 - a server may answer anything
+                if not isinstance(error, EXPECTED):
+                    self.own_faults.note(error, "reading a message of the server", time.monotonic())
                 received = []
                 await asyncio.sleep(REFUSED_PAUSE)
                 continue
-            result, received = response.Parameters, []
+            received = []
             if (take := self._takers.get(result.SubscriptionId)) is not None:
                 take(result)
             if result.NotificationMessage.NotificationData:
