@@ -4,11 +4,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from benchmarks.estimators.cases import Case, cases, start, windows
+from pymoo.algorithms.soo.nonconvex.pso import PSO
 
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.global_search import GlobalMinimum, SearchScale, search_window
@@ -80,6 +81,39 @@ def test_a_population_of_any_size_falls_into_the_valley(name: AlgorithmName, siz
     random, options = np.random.default_rng(3), SwarmOptions(algorithm=name, size=size)
     found = minimise(bowl, latin_hypercube(size, dimensions, random), options, random)
     assert found.position == pytest.approx(BEST[:dimensions], abs=0.1)
+
+
+def of_pymoo(first: Array, _: SwarmOptions) -> Any:
+    """The swarm of pymoo itself, with its particles as objects."""
+    return PSO(pop_size=len(first), sampling=first, w=0.9, c1=2.0, c2=2.0, adaptive=True)
+
+
+def corner(positions: Array) -> Array:
+    """Least in a corner of the cube, in steps: many places have equal costs."""
+    return np.asarray(1.0 + np.floor(8.0 * positions).sum(axis=1))
+
+
+@pytest.mark.parametrize("cost", [Valleys(), corner], ids=["valleys", "corner"])
+@pytest.mark.parametrize(("size", "dimensions"), [(15, 1), (3, 3), (15, 3), (40, 2), (15, 9)])
+def test_the_swarm_moves_as_pymoos_to_the_last_bit(
+    cost: Callable[[Array], Array], size: int, dimensions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(seed: int) -> list[Array]:
+        calls, random, options = list[Array](), np.random.default_rng(seed), SwarmOptions(generations=150)
+
+        def recorded(positions: Array) -> Array:
+            calls.append(positions.copy())
+            return cost(np.clip(positions[:, :3], 0.0, 1.0))
+
+        minimise(recorded, latin_hypercube(size, dimensions, random), options, random)
+        return calls
+
+    ours = [run(seed) for seed in range(3)]
+    monkeypatch.setitem(ALGORITHMS, "pso", of_pymoo)
+    for own, seed in zip(ours, range(3), strict=True):
+        pymoos = run(seed)
+        assert len(own) == len(pymoos) > 10
+        assert all(map(np.array_equal, own, pymoos))
 
 
 @pytest.mark.parametrize("name", NAMES)

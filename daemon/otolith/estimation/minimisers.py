@@ -22,6 +22,7 @@ MIN_IMPROVEMENT = 1e-6  # least decrease of χ²; above χ² = 1e6, the share 1e
 STALLED = 20  # generations without improvement after which a population ends
 IMPROVED = 0.9  # ratio of two squared costs, as of χ², that counts as an improvement
 FIRST_SIGMA = 0.3  # of the unit cube: standard deviation of the first population of CMA-ES, as its authors advise
+REDRAWN = 20  # times that pymoo draws the velocity of a particle anew which would leave the cube
 MIN_DIMENSIONS = 2  # CMA-ES needs two; a further one has no effect on the cost
 
 
@@ -194,14 +195,106 @@ def _set_up(cost: Cost, first: Array, options: SwarmOptions, random: np.random.G
         def __init__(self) -> None:
             super().__init__(n_var=first.shape[1], n_obj=1, xl=0.0, xu=1.0)
 
+        def cost(self, x: Array) -> Array:
+            return cost(x[:, :used])
+
         def _evaluate(self, x: Array, out: dict[str, Array], *_: object, **__: object) -> None:
-            out["F"] = cost(x[:, :used])
+            out["F"] = self.cost(x)
 
     algorithm = ALGORITHMS[options.algorithm](first, options)
     algorithm.setup(UnitCube(), termination=NoTermination(), seed=int(random.integers(2**31)))
     if options.algorithm == "cmaes":  # its seed would be that of all random numbers of NumPy
         algorithm.options |= {"seed": np.nan, "randn": lambda *shape: random.standard_normal(shape)}
     return algorithm
+
+
+@dataclass(slots=True, eq=False)
+class _Places:
+    """Positions (members, dimensions) and their costs (members, 1), which pymoo asks a population for by these keys."""
+
+    positions: Array
+    costs: Array
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def get(self, *keys: str) -> Any:
+        found = [{"X": self.positions, "F": self.costs}[key] for key in keys]
+        return found if len(found) > 1 else found[0]
+
+
+class _Swarm:
+    """pymoo's particle swarm, moved by pymoo's functions: the same positions, to the last bit.
+
+    pymoo keeps each particle as an object with dictionaries, which costs several times what the kernel does. Here the
+    particles are rows of arrays.
+    """
+
+    def __init__(self, pymoo: Any, first: Array) -> None:
+        self._pymoo, self._positions = pymoo, first.copy()
+        self._velocities = np.zeros(first.shape)
+        self._own = _Places(first, np.zeros((0, 1)))  # The best place of each particle
+
+    def setup(self, problem: Any, **keys: object) -> None:
+        self._pymoo.setup(problem, **keys)
+
+    def has_next(self) -> bool:
+        return True
+
+    def next(self) -> None:
+        pymoo = self._pymoo
+        if not len(self._own.costs):
+            self._own = _Places(self._positions.copy(), self._cost())
+            self._velocities = pymoo.random_state.random(self._positions.shape) * pymoo.V_max[None, :]
+            return
+        best = int(self._own.costs.argmin())
+        pymoo.sbest = _Places(np.repeat(self._own.positions[best : best + 1], len(self._own), axis=0), np.zeros((0, 1)))
+        self._move(best)
+        self._keep(self._cost())
+        pymoo.pop = self._own
+        pymoo._adapt()
+
+    def _cost(self) -> Array:
+        return np.asarray(self._pymoo.problem.cost(self._positions))[:, None]
+
+    def _move(self, best: int) -> None:
+        """Move all particles, by other random numbers where one would leave the cube; change the best place a little.
+
+        As in ``PSO._infill`` of pymoo.
+        """
+        from pymoo.algorithms.soo.nonconvex.pso import pso_equation, repair_random_init  # noqa: PLC0415
+        from pymoo.core.individual import Individual  # noqa: PLC0415
+        from pymoo.core.population import Population  # noqa: PLC0415
+        from pymoo.operators.mutation.pm import PM  # noqa: PLC0415
+
+        pymoo, random = self._pymoo, self._pymoo.random_state
+        before, velocities, own, social = self._positions, self._velocities, self._own.positions, pymoo.sbest.positions
+        settings = (pymoo.V_max, pymoo.w, pymoo.c1, pymoo.c2)
+        moved, changed = pso_equation(before, own, social, velocities, *settings, random_state=random)
+        for _ in range(REDRAWN):
+            out = np.flatnonzero(((moved < 0.0) | (moved > 1.0)).any(axis=1))
+            if not len(out):
+                break
+            states = (before[out], own[out], social[out], velocities[out])
+            moved[out], changed[out] = pso_equation(*states, *settings, random_state=random)
+        moved = repair_random_init(moved, before, *pymoo.problem.bounds(), random_state=random)
+        mutation = PM(prob=0.9, eta=random.uniform(5, 30), at_least_once=False)
+        place = Population(Individual(X=own[best]))
+        moved[best] = mutation(pymoo.problem, place, random_state=random)[0].X
+        self._positions, self._velocities = moved, changed
+
+    def _keep(self, costs: Array) -> None:
+        """Keep the places that are better than a particle's own, except one that another particle has or had."""
+        own = self._own
+        better = (costs < own.costs)[:, 0]
+        for row in np.flatnonzero(better):
+            place = self._positions[row]
+            better[row] = not (
+                (self._positions[:row] == place).all(axis=1).any() or (own.positions == place).all(axis=1).any()
+            )
+        self._own = _Places(
+            np.where(better[:, None], self._positions, own.positions), np.where(better[:, None], costs, own.costs)
+        )
 
 
 def _particle_swarm(first: Array, options: SwarmOptions) -> Any:
@@ -212,9 +305,10 @@ def _particle_swarm(first: Array, options: SwarmOptions) -> Any:
     """
     from pymoo.algorithms.soo.nonconvex.pso import PSO  # noqa: PLC0415
 
-    return PSO(
+    pymoo = PSO(
         pop_size=len(first), sampling=first, w=options.inertia, c1=options.cognitive, c2=options.social, adaptive=True
     )
+    return _Swarm(pymoo, first)
 
 
 def _differential_evolution(first: Array, _: SwarmOptions) -> Any:
