@@ -1,6 +1,7 @@
 """What measured records have and no twin: it is published as not explained, and no sensor is blamed for it."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -8,6 +9,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.discovery.alternatives import WindowDecision
 from otolith.discovery.hypotheses import FaultType
+from otolith.health.schema import ReportDocument
 from tests.adaptation.measured_like import (
     TRUTH,
     Imperfections,
@@ -26,6 +28,12 @@ SURE = 0.95
 LIMIT = 1.5  # A: at 22 V the motor draws 2.2 A
 CLIPPED = "i is clipped at"
 SEEDS = pytest.mark.parametrize("seeds", [FEW, pytest.param(MANY, marks=pytest.mark.full)])
+
+
+@cache
+def reported(free: tuple[str, ...], seed: int, have: Imperfections) -> list[ReportDocument]:
+    """The reports of a run, which several tests look at."""
+    return reports(motor_problem(*free), motor_windows(seed, WINDOWS, have))
 
 
 @SEEDS
@@ -49,7 +57,7 @@ def test_no_hypothesis_is_sure_that_does_not_explain_the_data(
     """
     sure, faulty = 0, 0
     for seed in range(seeds):
-        documents = reports(motor_problem("R_a", "D"), motor_windows(seed, WINDOWS, have))
+        documents = reported(("R_a", "D"), seed, have)
         assert not any(document.components for document in documents)
         faulty += bool(blamed(documents) - {"i" if have.limit else ""})
         stated = [item for document in documents for item in document.explanations]
@@ -71,7 +79,7 @@ def test_a_ripple_that_sampling_turns_into_a_slow_one_is_no_offset_of_a_sensor(s
 
     Where the beat takes minutes, the current sensor does read off for all eight windows.
     """
-    faults = [blamed(reports(motor_problem("R_a", "D"), motor_windows(seed, WINDOWS, have))) for seed in range(seeds)]
+    faults = [blamed(reported(("R_a", "D"), seed, have)) for seed in range(seeds)]
     assert sum(map(bool, faults)) <= 0.1 * seeds
 
 
@@ -82,7 +90,7 @@ def test_only_the_clipped_sensor_is_named(seeds: int, noise: float, free: tuple[
     """Not another signal that is early, nor parameters that moved. All that is published holds the truth."""
     inside = published = misnamed = 0
     for seed in range(seeds):
-        documents = reports(motor_problem(*free), motor_windows(seed, WINDOWS, Imperfections(LIMIT, noise)))
+        documents = reported(free, seed, Imperfections(LIMIT, noise))
         assert blamed(documents) == {"i"}
         texts = [finding.text for document in documents for finding in document.findings if finding.subject == "i"]
         misnamed += any(CLIPPED not in text for text in texts)
