@@ -3,10 +3,11 @@
     python -m benchmarks.hall --machines 20 --machines 50 --seconds 60
 
 Each machine is a DC motor whose record of 100 Hz is replayed in real time, in windows of 2 s; a share of them has a
-winding that loses turns. The daemon is ``otolith run FOLDER`` in the environment of its unit. Measured are, from the
-moment at which all workers are ready: processor time and memory (PSS, of all its processes), the latency of reports
-(from the end of a window until it is published), the windows that were missed, and by how much the histories grow.
-Exponents say how the costs grow with the number of machines.
+winding that loses turns. Of some of them (``--can``) the record is sent by another process, as two frames for each
+row, on virtual CAN buses (``--buses``). The daemon is ``otolith run FOLDER`` in the environment of its unit. Measured
+are, from the moment at which all workers are ready: processor time and memory (PSS, of all its processes), the latency
+of reports (from the end of a window until it is published), the windows that were missed, and by how much the
+histories grow. Exponents say how the costs grow with the number of machines.
 
 A computer that is busy with something else delays reports and lets windows be missed. Memory is the same on it, and
 while no window is missed also bytes and the processor time for each window.
@@ -34,6 +35,7 @@ import psutil
 from rich.table import Table
 
 from benchmarks.command_line import print_pages
+from benchmarks.hall_buses import driver_table, free_port, sending
 from otolith.health.schema import CountersDocument, ReportDocument
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
@@ -49,15 +51,7 @@ PATIENCE = 300.0  # s until the first report of the last machine
 MACHINE = """[machine]
 name = "{name}"
 site = "hall"
-[driver]
-type = "replay"
-file = "{record}.csv"
-repeat = true
-[signals]
-V_a = {{}}
-T_load = {{}}
-i = {{}}
-omega = {{}}
+{driver}
 [twin]
 name = "dc_motor"
 [parameters]
@@ -77,12 +71,24 @@ T_load = "0.2 mN*m"
 listen = ["{endpoint}"]
 """
 
+REPLAY = """[driver]
+type = "replay"
+file = "{record}.csv"
+repeat = true
+[signals]
+V_a = {{}}
+T_load = {{}}
+i = {{}}
+omega = {{}}
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class HallFigures:
     """What one hall cost."""
 
     machines: int
+    on_buses: int  # Of them, those whose frames came over a bus
     seconds: float  # Measured
     cores: float  # Processor time of all processes, per second
     cores_of_each: tuple[float, ...]  # First the process that acquires, as for memory
@@ -120,16 +126,35 @@ def write_records(folder: Path, seconds: float) -> None:
                 )
 
 
-def write_hall(folder: Path, machines: int, faulty: float, endpoint: str) -> Path:
-    """Write the machine files of a hall, and return their folder."""
-    hall = folder / f"hall-{machines}"
-    hall.mkdir()
+@dataclass(frozen=True, slots=True)
+class Hall:
+    """The files of a hall, and what its buses carry."""
+
+    folder: Path
+    port: int
+    buses: list[list[Path]]  # The records of the machines on each
+
+    @property
+    def on_buses(self) -> int:
+        """How many machines are on buses."""
+        return sum(map(len, self.buses))
+
+
+def write_hall(folder: Path, machines: int, faulty: float, endpoint: str, can: float = 0.0, buses: int = 4) -> Hall:
+    """Write the machine files of a hall, of which the share ``can`` is on so many buses."""
+    hall = Hall(folder / f"hall-{machines}", free_port(), [[] for _ in range(buses)])
+    hall.folder.mkdir()
     for name in ("healthy", "faulty"):
-        (hall / f"{name}.csv").symlink_to(folder / f"{name}.csv")
+        (hall.folder / f"{name}.csv").symlink_to(folder / f"{name}.csv")
     for number in range(machines):
         record = "faulty" if number < faulty * machines else "healthy"
-        text = MACHINE.format(name=f"motor-{number:03d}", record=record, endpoint=endpoint)
-        (hall / f"motor-{number:03d}.toml").write_text(text, encoding="utf-8")
+        driver = REPLAY.format(record=record)
+        if machines - number <= round(can * machines):  # the last ones
+            bus = number % buses
+            driver = driver_table(bus, hall.port, len(hall.buses[bus]))
+            hall.buses[bus].append(folder / f"{record}.csv")
+        text = MACHINE.format(name=f"motor-{number:03d}", driver=driver, endpoint=endpoint)
+        (hall.folder / f"motor-{number:03d}.toml").write_text(text, encoding="utf-8")
     return hall
 
 
@@ -139,8 +164,9 @@ def pss(process: psutil.Process) -> float:
     return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
 
 
-def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, endpoint: str) -> HallFigures:
-    """Run a daemon for the machines of ``paths``, and return what it cost."""
+def measure(hall: Hall, machines: int, seconds: float, folder: Path, endpoint: str) -> HallFigures:
+    """Run a daemon for the machines of a hall, and return what it cost."""
+    paths = [next(hall.folder.glob("*.toml"))] if machines == 1 else [hall.folder]
     state = folder / f"state-{machines}"
     environment = {
         **os.environ,
@@ -151,14 +177,14 @@ def measure(paths: Sequence[Path], machines: int, seconds: float, folder: Path, 
     (folder / "run").mkdir(mode=0o700, exist_ok=True)
     received: queue.SimpleQueue[str] = queue.SimpleQueue()
     command = [sys.executable, "-m", "otolith", "run", *map(str, paths)]
-    with (folder / f"daemon-{machines}.log").open("wb") as log:
+    with sending(hall.port, RATE, hall.buses), (folder / f"daemon-{machines}.log").open("wb") as log:
         daemon = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - our own command
         try:
             with Subscriber(Connection((endpoint,)), received.put):
                 known = _wait_for_all(received, machines, daemon)
                 time.sleep(SETTLING)
                 known |= {document.machine: document for document in _taken(received)}
-                return _measured(daemon, received, known, seconds, state)
+                return _measured(daemon, received, known, (seconds, hall.on_buses), state)
         finally:
             daemon.send_signal(signal.SIGTERM)
             daemon.wait(timeout=60)
@@ -187,10 +213,11 @@ def _measured(
     daemon: "subprocess.Popen[bytes]",
     received: "queue.SimpleQueue[str]",
     known: Mapping[str, ReportDocument],
-    seconds: float,
+    run: tuple[float, int],
     state: Path,
 ) -> HallFigures:
-    """Measure for so long; ``known`` has the last report of each machine before."""
+    """Measure; ``known`` has the last report of each machine before, ``run`` the time in s and machines on buses."""
+    seconds, on_buses = run
     root = psutil.Process(daemon.pid)
     tree = [root, *root.children(recursive=True)]
     spent, begun = [sum(each.cpu_times()[:2]) for each in tree], time.monotonic()
@@ -209,6 +236,7 @@ def _measured(
 
     return HallFigures(
         machines=len(known),
+        on_buses=on_buses,
         seconds=elapsed,
         cores=sum(cores),
         cores_of_each=cores,
@@ -245,8 +273,10 @@ def exponents(figures: Sequence[HallFigures]) -> dict[str, float]:
 @click.option("--machines", multiple=True, type=click.IntRange(1), default=(1, 20, 50), show_default=True)
 @click.option("--seconds", default=60.0, show_default=True, help="Measured for each hall.")
 @click.option("--faulty", default=0.1, show_default=True, help="Share of the machines with a fault.")
+@click.option("--can", default=0.0, show_default=True, help="Share of the machines that are on CAN buses.")
+@click.option("--buses", default=4, show_default=True, type=click.IntRange(1, 200), help="CAN buses.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON document.")
-def main(machines: tuple[int, ...], seconds: float, faulty: float, as_json: bool) -> None:
+def main(machines: tuple[int, ...], seconds: float, faulty: float, can: float, buses: int, as_json: bool) -> None:
     """Measure halls of machines."""
     figures = []
     with tempfile.TemporaryDirectory(prefix="otolith-hall-") as name:
@@ -254,19 +284,28 @@ def main(machines: tuple[int, ...], seconds: float, faulty: float, as_json: bool
         write_records(folder, 90.0)
         for count in machines:
             endpoint = f"unixsock-stream/{folder}/reports-{count}.sock"
-            hall = write_hall(folder, count, faulty, endpoint)
-            paths = [next(hall.glob("*.toml"))] if count == 1 else [hall]
-            figures.append(measure(paths, count, seconds, folder, endpoint))
+            hall = write_hall(folder, count, faulty, endpoint, can, buses)
+            figures.append(measure(hall, count, seconds, folder, endpoint))
             print(asdict(figures[-1]), file=sys.stderr)
     if as_json:
         print(json.dumps({"halls": [asdict(each) for each in figures], "exponents": exponents(figures)}, indent=2))
         return
-    titles = "machines", "cores", "ms per window", "PSS, MB", "latency 50 / 99 / 100 %, ms", "reports", "missed"
+    titles = (
+        "machines",
+        "on CAN",
+        "cores",
+        "ms per window",
+        "PSS, MB",
+        "latency 50 / 99 / 100 %, ms",
+        "reports",
+        "missed",
+    )
     table = Table(*titles, "lost samples", "history, kB")
     for each in figures:
         latency = f"{each.latency_median_ms:.0f} / {each.latency_99_ms:.0f} / {each.latency_max_ms:.0f}"
         row = (
             each.machines,
+            each.on_buses,
             f"{each.cores:.2f}",
             f"{each.ms_per_window:.1f}",
             f"{each.pss_mb:.0f}",
