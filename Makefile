@@ -39,11 +39,13 @@ SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no
 test: $(DEV)
 	$(SHARED) -m "not full and not timed"
 
-# Timed tests run last and one at a time, with exact limits. LONG="not timed" runs the tests of make test as well.
+# Timed tests run last and one at a time, with exact limits; only files that name the marker are read for them.
+# LONG="not timed" runs the tests of make test as well.
 LONG = full and not timed
+TIMED = grep -rli --include='test_*.py' --exclude-dir=vm timed tests
 test-full: $(DEV)
 	@$(SHARED) -m "$(LONG)"; shared=$$?; \
-	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed; timed=$$?; exit $$((shared | timed))
+	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed $$($(TIMED)); timed=$$?; exit $$((shared | timed))
 
 system-test: $(DEV)
 	@PYTHON=$(BIN)/python tests/vm/all.sh
