@@ -44,6 +44,10 @@ WHITE_SIGNIFICANCE = 1e-3  # probability of a test's result by chance, below whi
 BAND_RATIO = 4.0  # between the ends of a band of the spectrum
 
 
+Estimates = Sequence[tuple[Array, Array]]
+"""Of each window the square root of its information about some values, and that times their estimates."""
+
+
 @dataclass(frozen=True, slots=True)
 class Band:
     """The power of the innovations between two frequencies."""
@@ -158,8 +162,8 @@ def consistency_test(fits: Fits, width: Array, changes: Sequence[float] = ()) ->
 
     ``width`` (guess,) is :attr:`Likelihood.width`.
     """
-    parts = [_about_mean([_whitened(fit, width) for fit in part]) for part in regimes(fits, changes)]
-    chi_square, degrees = sum(part[0] for part in parts), sum(part[1] for part in parts)
+    parts = [CommonValues.of([whitened(fit, width) for fit in part]) for part in regimes(fits, changes)]
+    chi_square, degrees = sum(part.chi_square for part in parts), sum(part.degrees for part in parts)
     return ChiSquareTest(chi_square / degrees if degrees else float("nan"), degrees)
 
 
@@ -175,50 +179,79 @@ def changes_of_the_machine(fits: Fits, width: Array) -> tuple[float, ...]:
     """
     if consistency_test(fits, width).passed:
         return ()
-    return tuple(fits[at].window.start for at in _changes([_whitened(fit, width) for fit in fits]))
+    return tuple(fits[at].window.start for at in _changes([whitened(fit, width) for fit in fits]))
 
 
-def _changes(rows: Sequence[tuple[Array, Array]]) -> list[int]:
+def _changes(rows: Estimates) -> list[int]:
     """Return which windows are the first after a change.
 
     The window in which it falls belongs to neither side. The probability of a change by chance is that of an F test,
     times the number of tests.
     """
-    from scipy.special import fdtrc  # noqa: PLC0415 - only noise identification needs SciPy
-
     trials = []
     for at in range(MIN_REGIME, len(rows) - MIN_REGIME):
         for reach in (MIN_REGIME, len(rows)):  # the nearest windows alone show a change that is taken back
-            sides = rows[max(0, at - reach) : at], rows[at + 1 : at + 1 + reach]
-            within, degrees = np.sum([_about_mean(side) for side in sides], axis=0)
-            together, all_degrees = _about_mean([*sides[0], *sides[1]])
-            more = all_degrees - degrees
-            if degrees and more:
-                ratio = (together - within) / more / max(within / degrees, 1.0)
-                trials.append((float(fdtrc(more, degrees, ratio)), -ratio, at))
+            rest = [*rows[max(0, at - reach) : at], *rows[at + 1 : at + 1 + reach]]
+            same, apart = CommonValues.of(rest), CommonValues.of(rest, step_at(min(at, reach), len(rest)))
+            if 0 < apart.degrees < same.degrees:
+                chance, ratio = chance_of_change(same, apart)
+                trials.append((chance, -ratio, at))
     probability, _, at = min(trials, default=(1.0, 0.0, 0))
     if not trials or probability * len(trials) > CHANGE_SIGNIFICANCE:
         return []
     before, after = rows[:at], rows[at + 1 :]
-    misfits = [_about_mean([*side, rows[at]])[0] - _about_mean(side)[0] for side in (before, after)]
+    misfits = [
+        CommonValues.of([*own, rows[at]]).chi_square - CommonValues.of(own).chi_square for own in (before, after)
+    ]
     first = at + 1 if misfits[0] < misfits[1] else at
     return [*_changes(before), first, *(at + 1 + later for later in _changes(after))]
 
 
-def _whitened(fit: FittedWindow, width: Array) -> tuple[Array, Array]:
+def whitened(fit: FittedWindow, width: Array, own: Sequence[int] | None = None) -> tuple[Array, Array]:
     """Return :func:`sqrt_information` and the estimate multiplied by it, of unit variance."""
-    root, free = sqrt_information(fit, width), fit.objective.free
-    return root, root @ (fit.guess[:free] / width[:free])
+    root, places = sqrt_information(fit, width, own), list(range(fit.objective.free) if own is None else own)
+    return root, root @ (fit.guess[places] / width[places])
 
 
-def _about_mean(rows: Sequence[tuple[Array, Array]]) -> tuple[float, int]:
-    """Return chi-square of whitened estimates about their weighted mean, and its degrees of freedom."""
-    stacked, estimates = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    if not len(stacked):
-        return 0.0, 0
-    mean, _, rank, _ = np.linalg.lstsq(stacked, estimates, rcond=None)
-    deviations = stacked @ mean - estimates
-    return float(deviations @ deviations), len(stacked) - int(rank)
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonValues:
+    """The weighted least squares of what windows estimate, in units of the width."""
+
+    chi_square: float  # That it leaves
+    degrees: int  # Of freedom that are left
+    values: Array  # (terms, values)
+    stacked: Array  # (determined directions, terms * values)
+
+    @classmethod
+    def of(cls, rows: Estimates, shape: Array | None = None) -> "CommonValues":
+        """Return those of values that are linear combinations of the terms ``shape`` (windows, terms).
+
+        By default, they are the same in all windows.
+        """
+        terms = np.ones((len(rows), 1)) if shape is None else shape
+        stacked = np.vstack([np.kron(own, root) for (root, _), own in zip(rows, terms, strict=True)])
+        estimates = np.concatenate([estimate for _, estimate in rows])
+        found, _, rank, _ = np.linalg.lstsq(stacked, estimates, rcond=None)
+        errors = stacked @ found - estimates
+        return cls(float(errors @ errors), len(estimates) - int(rank), found.reshape(terms.shape[1], -1), stacked)
+
+
+def step_at(at: int, count: int) -> Array:
+    """Return the terms (windows, 2) of values that are others from window ``at`` on."""
+    return np.column_stack([np.ones(count), np.arange(count) >= at])
+
+
+def chance_of_change(same: CommonValues, changed: CommonValues) -> tuple[float, float]:
+    """Return the probability that noise alone explains by how much less a model of change leaves, and the F ratio.
+
+    The scatter that it leaves counts, so that windows which an imperfect twin explains differently are no change.
+    """
+    from scipy.special import fdtrc  # noqa: PLC0415 - only commissioning needs SciPy
+
+    more = same.degrees - changed.degrees
+    reduced = max(changed.chi_square / changed.degrees, 1.0)
+    ratio = (same.chi_square - changed.chi_square) / more / reduced
+    return float(fdtrc(more, changed.degrees, ratio)), ratio
 
 
 def outlyingness(fits: Fits, index: int, width: Array) -> float:
@@ -251,15 +284,16 @@ def _normal_deviate(chi_square: float, degrees: int) -> float:
     return float((np.cbrt(chi_square / degrees) - 1.0 + spread) / np.sqrt(spread))
 
 
-def sqrt_information(fit: FittedWindow, width: Array) -> Array:
-    """(determined directions, free) square root of the information about the parameters, in units of ``width``.
+def sqrt_information(fit: FittedWindow, width: Array, own: Sequence[int] | None = None) -> Array:
+    """(determined directions, own) square root of the information about its ``own`` values, in units of ``width``.
 
-    The initial state is eliminated. Residuals larger than the noise reduce the information.
+    They are all parameters by default. All others, and the initial state, are eliminated. Residuals larger than the
+    noise reduce the information.
     """
-    free = fit.objective.free
-    states = Elimination.of(fit.result.jacobian[:, free:], width[free:])
-    own = states.left(fit.result.jacobian[:, :free] * width[:free])
-    _, singular, directions = np.linalg.svd(own, full_matrices=False)
+    jacobian, places = fit.result.jacobian, list(range(fit.objective.free) if own is None else own)
+    others = [place for place in range(len(width)) if place not in places]
+    left = Elimination.of(jacobian[:, others], width[others]).left(jacobian[:, places] * width[places])
+    _, singular, directions = np.linalg.svd(left, full_matrices=False)
     singular = singular / np.sqrt(fit.discount)
     determined = singular > MIN_INFORMATION
     return np.asarray(singular[determined, None] * directions[determined])

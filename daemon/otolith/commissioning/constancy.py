@@ -13,10 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.commissioning.consistency import CHANGE_SIGNIFICANCE, MIN_INFORMATION, MIN_REGIME
+from otolith.commissioning.consistency import (
+    CHANGE_SIGNIFICANCE,
+    MIN_REGIME,
+    CommonValues,
+    Estimates,
+    chance_of_change,
+    step_at,
+    whitened,
+)
 from otolith.commissioning.identification import with_initial_noise
-from otolith.commissioning.likelihood import FittedWindow, Likelihood
-from otolith.estimation.evidence import Elimination
+from otolith.commissioning.likelihood import Likelihood
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 
@@ -51,16 +58,6 @@ class _Model:
     place: int | None = None  # Of the first window after a step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Explained:
-    """The least squares of a model."""
-
-    chi_square: float
-    degrees: int  # Of freedom that are left
-    values: Array  # (terms, values) in units of width
-    covariance: Array  # (terms * values, terms * values)
-
-
 def value_changes(problem: Problem, windows: Sequence[Window], names: Sequence[str]) -> tuple[ValueChange, ...]:
     """Return which parameters ``names`` of ``problem`` change in the record, by more than LEAST_CHANGE.
 
@@ -73,44 +70,23 @@ def value_changes(problem: Problem, windows: Sequence[Window], names: Sequence[s
     fits = [likelihood.fit(levels, window, [there.nominal]) for window in windows]
     places = [row.name for row in problem.free]
     own = [places.index(name) for name in names]
-    rows = [_whitened(fit, likelihood.width, own) for fit in fits]
+    rows = [whitened(fit, likelihood.width, own) for fit in fits]
     model, fitted = _best_model(rows, [window.start for window in windows])
     if model is None:
         return ()
     return tuple(_changes(model, fitted, likelihood.width[own], names, windows))
 
 
-def _whitened(fit: FittedWindow, width: Array, own: Sequence[int]) -> tuple[Array, Array]:
-    """Return the square root of the information of a window about the values, and that times their estimates."""
-    others = [place for place in range(len(width)) if place not in own]
-    left = Elimination.of(fit.result.jacobian[:, others], width[others]).left(fit.result.jacobian[:, own] * width[own])
-    _, singular, directions = np.linalg.svd(left, full_matrices=False)
-    singular = singular / np.sqrt(fit.discount)
-    determined = singular > MIN_INFORMATION
-    root = singular[determined, None] * directions[determined]
-    return root, root @ (fit.guess[own] / width[own])
-
-
-def _best_model(rows: Sequence[tuple[Array, Array]], starts: Sequence[float]) -> "tuple[_Model | None, _Explained]":
+def _best_model(rows: Estimates, starts: Sequence[float]) -> tuple[_Model | None, CommonValues]:
     """Return the model of change that leaves least, if it is true; a drift unless a step explains decisively more."""
-    from scipy.special import fdtrc  # noqa: PLC0415 - only commissioning needs SciPy
-
-    same = _explained(rows, np.ones((len(rows), 1)))
+    same = CommonValues.of(rows)
     drifts = [_Model(shape) for shape in _drifts(np.array(starts))]
     steps = [_Model(_step(len(rows), at), at) for at in range(MIN_REGIME, len(rows) - MIN_REGIME + 1)]
-    trials = [(model, _explained(rows, model.shape)) for model in (*drifts, *steps)]
-    trials = [(model, found) for model, found in trials if found.degrees > 0 and same.degrees > found.degrees]
-
-    def left(trial: tuple[_Model, _Explained]) -> float:
-        return trial[1].chi_square / trial[1].degrees
-
-    best = min(trials, key=left, default=None)
-    if best is None:
-        return None, same
-    model, found = best
-    more, reduced = same.degrees - found.degrees, max(left(best), 1.0)
-    chance = float(fdtrc(more, found.degrees, (same.chi_square - found.chi_square) / more / reduced))
-    return (model, found) if chance * len(trials) < CHANGE_SIGNIFICANCE else (None, same)
+    trials = [(model, CommonValues.of(rows, model.shape)) for model in (*drifts, *steps)]
+    trials = [(model, found) for model, found in trials if 0 < found.degrees < same.degrees]
+    best = min(trials, key=lambda trial: trial[1].chi_square / trial[1].degrees, default=None)
+    is_true = best is not None and chance_of_change(same, best[1])[0] * len(trials) < CHANGE_SIGNIFICANCE
+    return best if best is not None and is_true else (None, same)
 
 
 def _drifts(starts: Array) -> Iterator[Array]:
@@ -124,25 +100,16 @@ def _drifts(starts: Array) -> Iterator[Array]:
 
 def _step(count: int, at: int) -> Array:
     """Return the terms of a value that is another from window ``at`` on, in which the change may fall."""
-    places = np.arange(count)
-    return np.column_stack([np.ones(count), places >= at, places == at]).astype(np.float64)
-
-
-def _explained(rows: Sequence[tuple[Array, Array]], shape: Array) -> _Explained:
-    stacked = np.vstack([np.kron(terms, root) for (root, _), terms in zip(rows, shape, strict=True)])
-    estimates = np.concatenate([estimate for _, estimate in rows])
-    found, _, rank, _ = np.linalg.lstsq(stacked, estimates, rcond=None)
-    errors = stacked @ found - estimates
-    covariance = np.linalg.pinv(stacked.T @ stacked, hermitian=True)
-    return _Explained(float(errors @ errors), len(estimates) - int(rank), found.reshape(shape.shape[1], -1), covariance)
+    return np.column_stack([step_at(at, count), np.arange(count) == at])
 
 
 def _changes(
-    model: _Model, fitted: _Explained, width: Array, names: Sequence[str], windows: Sequence[Window]
+    model: _Model, fitted: CommonValues, width: Array, names: Sequence[str], windows: Sequence[Window]
 ) -> Iterator[ValueChange]:
     """Yield the parameters whose change is beyond its interval and LEAST_CHANGE."""
     count, at = len(names), model.place
-    variance = max(fitted.chi_square / fitted.degrees, 1.0) * fitted.covariance
+    covariance = np.linalg.pinv(fitted.stacked.T @ fitted.stacked, hermitian=True)
+    variance = max(fitted.chi_square / fitted.degrees, 1.0) * covariance
     for place, name in enumerate(names):
         ends = [place, count + place]
         before, change = (float(value) for value in fitted.values[:2, place] * width[place])
