@@ -23,10 +23,10 @@ from benchmarks.other_situations import machine_with
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.operating_states import MIN_OFF, off_records, part_in_operation, running_part
+from otolith.adaptation.operating_states import off_records, part_in_operation, running_part
 from otolith.adaptation.state import initial_state
 from otolith.discovery.alternatives import WindowDecision
-from otolith.estimation.problem import MIN_OUTSIDE
+from otolith.estimation.problem import MIN_RUN
 from otolith.health.schema import Status
 from otolith.machine import LoadedMachine
 from tests.variants import often
@@ -73,7 +73,7 @@ def test_only_an_open_bridge_is_off() -> None:
     assert not off_records(MOTOR, window_of(broken)).any()
 
 
-@pytest.mark.parametrize(("records", "expected"), [(MIN_OFF - 1, 0), (MIN_OFF, MIN_OFF)])
+@pytest.mark.parametrize(("records", "expected"), [(MIN_RUN - 1, 0), (MIN_RUN, MIN_RUN)])
 def test_a_command_of_zero_for_few_records_is_no_stop(records: int, expected: int) -> None:
     _, values = simulate(Machine(), 4.0, 1)
     values[100 : 100 + records, [0, 2]] = 0.0
@@ -154,13 +154,13 @@ def test_a_pump_that_rests_behind_its_check_valve_is_no_event(seed: int) -> None
 def test_a_wrong_reading_is_no_stop() -> None:
     machine, windows = _pump_that_rests(1, 10.0)
     values = windows[1].values.copy()
-    values[100 : 100 + MIN_OUTSIDE - 1, machine.twin.signals.index("omega")] = 0.0
+    values[100 : 100 + MIN_RUN - 1, machine.twin.signals.index("omega")] = 0.0
     assert part_in_operation(machine.problem, replace(windows[1], values=values)) is None
-    values[100 : 100 + MIN_OUTSIDE, machine.twin.signals.index("omega")] = 0.0
+    values[100 : 100 + MIN_RUN, machine.twin.signals.index("omega")] = 0.0
     part = part_in_operation(machine.problem, replace(windows[1], values=values))
     assert part is not None
     assert part.window is not None
-    assert part.window.records == len(values) - 100 - MIN_OUTSIDE
+    assert part.window.records == len(values) - 100 - MIN_RUN
 
 
 def test_readings_are_counted_not_records() -> None:

@@ -13,12 +13,11 @@ import numpy as np
 
 from otolith.acquisition.window import Mask, Window, runs_of
 from otolith.estimation.evidence import SIGNIFICANT_DEVIATE
-from otolith.estimation.problem import Problem, out_of_operation, runs_outside
+from otolith.estimation.problem import MIN_RUN, Problem, out_of_operation, runs_outside
 from otolith.twin.definition import Definition
 from otolith.twin.expressions import names_in, parse
 from otolith_drivers.units import are_of_one_quantity, unit_text
 
-MIN_OFF = 5  # records without a command from which on a drive is off
 SWITCHING = 3  # records within which the current of an open bridge ends
 OFF_SHARE = 0.95  # of the records of a stretch whose current is zero within its noise
 MIN_ON_SHARE = 0.25  # of the records of a window: less between two stretches is not estimated from
@@ -72,7 +71,7 @@ def off_records(problem: Problem, window: Window) -> Mask:
         )
         for start, end in runs_of(without):
             begin = _end_of_current(is_zero[start:end])
-            if end - start - begin >= MIN_OFF:
+            if end - start - begin >= MIN_RUN:
                 off[start if begin <= SWITCHING else start + begin : end] = True
     return off
 

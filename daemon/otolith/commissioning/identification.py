@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.quality import time_text
+from otolith.acquisition.samples import MAD_TO_SD
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.commissioning.consistency import (
     MAX_OUTLYING_SHARE,
@@ -39,7 +40,7 @@ from otolith.commissioning.likelihood import (
     with_levels,
 )
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
-from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
+from otolith.estimation.data_checks import DIFFERENCE_ORDER, sample_differences
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.global_search import search_window
 from otolith.estimation.objective import Objective

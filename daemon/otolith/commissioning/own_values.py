@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Window
+from otolith.commissioning.consistency import WHITE_SIGNIFICANCE
 from otolith.commissioning.constancy import ValueChange, value_changes
 from otolith.commissioning.identification import identify_noise, sample_noise, usable_windows
 from otolith.commissioning.likelihood import Progress
@@ -38,7 +39,6 @@ WIDER = 1000.0  # times the example's values: how far a machine may be from it
 REACH = 4.0  # times a value: bounds of an estimate while components are searched
 FITTED_WINDOWS = 12  # in which the outputs move most
 MAX_ROUNDS = 4  # of values and delays in turn
-SIGNIFICANCE = 1e-3  # probability that a signal is named whose sign is right
 UNIT_FACTORS = {  # between two constants that are the same in SI units
     "rpm in place of rad/s": 30.0 / np.pi,
     "degrees in place of radians": 180.0 / np.pi,
@@ -240,7 +240,7 @@ def _is_better(misfits: Sequence[float], others: Sequence[float]) -> bool:
     if len(gains) < 2 or gains.mean() <= 0.0:
         return False
     deviation = float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    return deviation == 0.0 or bool(stdtr(len(gains) - 1.0, -gains.mean() / deviation) < SIGNIFICANCE)
+    return deviation == 0.0 or bool(stdtr(len(gains) - 1.0, -gains.mean() / deviation) < WHITE_SIGNIFICANCE)
 
 
 def _movement(twin: Definition, window: Window) -> float:

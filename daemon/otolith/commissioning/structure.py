@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.commissioning.consistency import MIN_REGIME, regimes, sqrt_information
+from otolith.commissioning.consistency import CHANGE_SIGNIFICANCE, MIN_REGIME, regimes, sqrt_information
 from otolith.commissioning.identification import IdentifiedNoise, usable_windows
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
 from otolith.discovery.candidate_forms import CandidateForm
@@ -34,25 +34,21 @@ from otolith.discovery.linear_response import (
 )
 from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
-from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE, Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE, MIN_EXPLAINED, Elimination
 from otolith.estimation.information import initial_prior
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
-from otolith.estimation.window_fit import Fit, fit
+from otolith.estimation.window_fit import AT_BOUND, Fit, fit
 from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
-CONFIRMED = 1e-6  # the same of what is adopted
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
-MIN_LINE = 6.0  # spectral lines: least frequency of a sine with one phase that is compared with its neighbours
+MIN_LINE = NEIGHBOURS[-1] + 1  # spectral lines: least frequency of a sine with one phase that has all neighbours
 MIN_SHARE = 0.5  # of the best score: candidates with less are dropped, unless they are a line above the spectrum
-SHORTEST = 1e-300  # of a source within a window: the frequency of a sine in it stays finite
 MAX_CONCENTRATION = 0.5  # sum of the squared shares of information: one window alone would decide
-ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
-AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # of a running twin that are searched together, and records of all of them
 MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
 SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
@@ -192,7 +188,7 @@ class PooledResponse(ProjectedResponse):
             return form
         low, high = form.bounds
         shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
-        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, SHORTEST)), high))
+        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).eps)), high))
 
     def stands_out(self, guess: Guess) -> bool:
         """Whether a sine gains more than its neighbours in the spectrum.
@@ -383,7 +379,7 @@ def _amplitude_sd(values: Array, information: Array) -> tuple[float, float]:
     explained = float(mean @ information.sum(axis=0) @ mean)
     left, degrees = values - mean, phases * (windows - 1.0)
     variance = float(np.einsum("wp,wpq,wq->", left, information, left)) / degrees
-    variance = max(variance, ROUNDING**2 * explained)
+    variance = max(variance, MIN_EXPLAINED**2 * explained)
     if not explained:
         return np.inf, 1.0
     chance = float(fdtrc(phases, degrees, explained / phases / variance))
@@ -426,7 +422,7 @@ class PooledWindows:
         shown, before = lacking_component(problem, windows), self.shown
         if shown is not None and before is not None and shown.component.key == before.component.key:
             one, other = shown.component.inner, before.component.inner
-            if abs(one - other) <= SAME_INNER * abs(one) and shown.chance < CONFIRMED:
+            if abs(one - other) <= SAME_INNER * abs(one) and shown.chance < CHANGE_SIGNIFICANCE:
                 return PooledWindows(confirmed=shown)
         longer = min(2 * self.next_pause, MAX_PAUSE)
         return PooledWindows(windows, self.next_pause if shown is None else 1, longer, shown)

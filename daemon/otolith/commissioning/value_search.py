@@ -11,21 +11,20 @@ from otolith.commissioning.dependence import Dependence, dependences, is_count, 
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
-from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE, STRUCTURE
+from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, SIGNIFICANT_DEVIATE, STRUCTURE
 from otolith.estimation.global_search import LEVELS
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import MAX_STEPS, FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay
+from otolith.estimation.window_fit import ALONE_STEPS
 from otolith.twin.definition import Parameter, Role
 from otolith_drivers.units import is_one_in_si
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-STAGE_STEPS = 12  # of Gauss-Newton
 QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
-MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
 WIDER_INTERVAL = 1.5  # times the interval of a parameter that is less than determined: accepted in the next fits
 PHASES = 8  # of a sine that are tried in each window
 
@@ -176,7 +175,7 @@ class ValueSearch:
                 values = window.column(name)[~window.missing_in(name)]
                 variance[at] += float(((values - values.mean()) ** 2).sum()) / level**2 if len(values) else 0.0
                 counts[at] += len(values)
-        moves = variance > MOVING**2 * counts
+        moves = variance > CERTAIN_DEVIATE**2 * counts
         shares = {name: float(1.0 - squares[at] / variance[at]) for at, name in enumerate(names) if moves[at]}
         return shares, tuple(misfits)
 
@@ -263,7 +262,7 @@ class ValueSearch:
         for share in LEVELS:
             self._progress(f"values of {len(shared)} parameters, stage {LEVELS.index(share) + 1} of {len(LEVELS) + 1}")
             staged = with_levels(problem, np.concatenate([noise, share * walk]))
-            guesses, _, _ = self._fit(_Stage(staged, moved, parameters, guesses), STAGE_STEPS)
+            guesses, _, _ = self._fit(_Stage(staged, moved, parameters, guesses), ALONE_STEPS)
             parameters = guesses[0][: len(parameters)]
         self._progress(f"values of {len(shared)} parameters, last stage")
         there = replace(problem, free=tuple(

@@ -14,6 +14,7 @@ from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
 from otolith.discovery.linear_response import MIN_REMAINDER
 from otolith.estimation.evidence import (
+    DECISIVE,
     STRUCTURE,
     Elimination,
     LogEvidence,
@@ -27,7 +28,7 @@ from otolith.estimation.problem import Component, Problem, augment, indices
 from otolith.estimation.timing import delay_response, delayable
 from otolith.estimation.window_fit import Fit
 
-MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is not tracked
+MAX_DEVIANCE = 3.0 * DECISIVE  # in -2 log evidence behind the best: a worse hypothesis is not tracked
 NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
 
 

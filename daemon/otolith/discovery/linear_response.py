@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.data_checks import median
-from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, Elimination, chi_square_left
+from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, MIN_EXPLAINED, Elimination, chi_square_left
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
@@ -29,7 +29,6 @@ MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of p
 MAX_BLOCK = 1 << 21  # residuals times curves that are computed at once: 16 MB
 PROBES = 16  # random vectors by which the length of a projected response is estimated
 PROBE_SETS = 4  # windows in turn have others: what one set underestimates, the next ones do not
-MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
 
 
 Guess = tuple[CandidateForm, float]  # A form and its inner parameter
@@ -135,7 +134,7 @@ class ProjectedResponse(ABC):
             a_1 = (b_1 - cross / n_22 * b_2) / (n_11 * independence)
             a_2 = np.where(single, 0.0, (b_2 - cross / n_11 * b_1) / (n_22 * independence))
             gain = a_1 * b_1 + a_2 * b_2
-        valid = np.isfinite(gain) & np.isfinite(a_1) & np.isfinite(a_2) & (independence > MIN_INDEPENDENCE)
+        valid = np.isfinite(gain) & np.isfinite(a_1) & np.isfinite(a_2) & (independence > MIN_EXPLAINED)
         amplitudes = np.where(valid, [a_1, a_2], 0.0).T
         return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
 

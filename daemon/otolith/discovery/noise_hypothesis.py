@@ -12,10 +12,11 @@ from math import comb
 
 import numpy as np
 
+from otolith.acquisition.samples import MAD_TO_SD
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis, largest_chi_square
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
-from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
+from otolith.estimation.data_checks import median, sample_differences
 from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE, LogEvidence
 from otolith.estimation.information import MIN_SINGULAR, initial_prior
 from otolith.estimation.problem import Problem

@@ -48,8 +48,8 @@ from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit
 
 MAX_HYPOTHESES = 7  # that are tracked after a search
-MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
-MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
+MAX_FIRST_EVIDENCE = 1.5 * DECISIVE  # in -2 log evidence: of the first window, so that the second one can outweigh it
+MAX_WINDOW_EVIDENCE = 2.0 * DECISIVE  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 3.0 * MAX_WINDOW_EVIDENCE  # in -2 log evidence: a hypothesis can return when things change
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place

@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.quality import time_text
-from otolith.acquisition.samples import Check
+from otolith.acquisition.samples import MAD_TO_SD, Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window, runs_of
 from otolith.estimation.evidence import CHANCE, chi_square_limit
 from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import MIN_RUN, Problem
 from otolith.estimation.sensor_models import RENEWED_DISTANCES, distance, is_driven_position, new_readings
 from otolith.estimation.window_fit import fit_predicted
 from otolith.twin.definition import Definition, Output
@@ -43,11 +43,9 @@ MAX_VALUE = 1e12  # magnitude of a value, in the unit of its signal
 SPIKE_HEIGHT = 12.0  # times the usual second difference of the channel: least height of a spike
 SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from that of a spike, which is a half at equal steps
 MAX_FAULTY_SHARE = 0.05  # share of records above which the channel is rejected
-MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
-SECOND_DIFFERENCE_SD = 1.2247  # standard deviation of the second difference of unit noise, the root of 3/2
+SECOND_DIFFERENCE_SD = np.sqrt(1.5)  # standard deviation of the second difference of unit noise, the root of 3/2
 DIFFERENCE_ORDER = 4  # differences of this order remove what a cubic follows over five records
 DIFFERENCE_GAIN = np.sqrt(70.0)  # of white noise by these differences: √(1² + 4² + 6² + 4² + 1²)
-MIN_FROZEN_RUN = 5  # records of one value
 FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
 FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
 RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be distinguished from motion over coarse steps
@@ -353,24 +351,24 @@ def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices],
     Only the records ``present`` count. The noise of the values in these runs, at least ``noise``, is returned as well.
     """
     samples, deviation = values[present], noise
-    if len(samples) < MIN_FROZEN_RUN:
+    if len(samples) < MIN_RUN:
         return [], noise
     second = np.abs(np.convolve(np.pad(samples, 1, mode="edge"), (-0.5, 1.0, -0.5), mode="valid"))
     top, high = samples.max(), samples >= samples.max() - PILE_WIDTH * noise
     for _ in range(PILE_ROUNDS):
         deviation = max(noise, MAD_TO_SD * median(second[high]) / SECOND_DIFFERENCE_SD)
         high = samples >= top - PILE_WIDTH * deviation
-    long = [present[first:end] for first, end in runs_of(high) if end - first >= MIN_FROZEN_RUN]
+    long = [present[first:end] for first, end in runs_of(high) if end - first >= MIN_RUN]
     return long, deviation if long else noise
 
 
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:
     """Return the records of each run of one and the same value that is long enough, among the ``present`` ones."""
     ends = np.flatnonzero(np.diff(values[present]) != 0.0) + 1
-    if len(present) - len(ends) < MIN_FROZEN_RUN:
+    if len(present) - len(ends) < MIN_RUN:
         return []
     edges = np.concatenate([[0], ends, [len(present)]])
-    long = np.flatnonzero(np.diff(edges) >= MIN_FROZEN_RUN)
+    long = np.flatnonzero(np.diff(edges) >= MIN_RUN)
     return [present[edges[run] : edges[run + 1]] for run in long]
 
 
@@ -476,7 +474,7 @@ def _lacks_noise(channel: _Channel, runs: list[Indices]) -> bool:
     second = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
     second = second[outside[:-2] & outside[1:-1] & outside[2:]]
     levels = np.unique(samples)
-    if len(second) < MIN_FROZEN_RUN or len(levels) < MIN_ADC_LEVELS:
+    if len(second) < MIN_RUN or len(levels) < MIN_ADC_LEVELS:
         return False
     step, stated = float(np.diff(levels).min()), channel.predicted.problem.noise[channel.index]
     deviation = min(stated, MAD_TO_SD * float(np.median(np.abs(second))) / SECOND_DIFFERENCE_SD)

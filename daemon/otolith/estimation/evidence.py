@@ -32,9 +32,8 @@ CHANCE_DEVIATE = 3.0  # within them it counts as chance; 0.3 % lie beyond
 SIGNIFICANT_DEVIATE = 4.0  # beyond them it is no chance, also of many tests in a row: 0.006 %
 CERTAIN_DEVIATE = 5.0  # no chance reaches them: 6e-7
 EXACT_DEGREES = 100  # of freedom, up to which the limit of χ² is exact; above, it is too large by 0.4 % at most
-ROUNDING = 1e-12  # share of a limit up to which it is computed
 STRUCTURE = 1.5  # RMSE over the noise, with the correlation of what is left, above which that is more than noise
-MIN_EXPLAINED = 1e-10  # relative singular value of a direction that a change of the unknowns explains
+MIN_EXPLAINED = 1e-10  # share of the largest singular value, or length, below which a direction is rounding
 NULL_ODDS = 3.0  # how much more probable the null hypothesis is than each other type, before any evidence
 
 
@@ -128,8 +127,7 @@ def chi_square_limit(degrees: int) -> float:
     if degrees > EXACT_DEGREES:
         return high
     low = float(degrees)
-    while high - low > ROUNDING * high:
-        middle = 0.5 * (low + high)
+    while low < (middle := 0.5 * (low + high)) < high:
         low, high = (middle, high) if _upper_tail(middle, degrees) > CHANCE else (low, middle)
     return high
 

@@ -27,7 +27,7 @@ ROUNDS_IF_EXPLAINED, ROUNDS_IF_NOT = 2, 3  # rounds that must reach the best min
 SAME_MINIMUM = 0.01  # share of χ² between two results of one minimum
 MAX_INTEGRATOR_STEPS = 300_000_000  # in one search: some seconds
 LOG_SCALE_RATIO = 10.0  # ratio of the bounds above which a parameter is searched by order of magnitude
-TURN = 2.0 * np.pi  # rad
+TURN = math.tau  # rad
 MAX_TURNS = 10  # by which Gauss-Newton may turn an angle beyond its bounds
 
 

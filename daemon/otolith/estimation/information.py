@@ -16,21 +16,21 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache, cached_property
 from itertools import chain, islice
+from statistics import NormalDist
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
-from otolith.estimation.evidence import CHANCE_DEVIATE, Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, MIN_EXPLAINED, Elimination
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 from otolith.twin.kernel import Indices
 from otolith_drivers.units import unit_text
 
-QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
+QUANTILE = NormalDist().inv_cdf(0.975)  # two-sided 95 % of the standard normal distribution
 MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not observed
-MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
-MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
+MAX_BLIND_SHARE = np.sqrt(MIN_SINGULAR)  # share in an unobserved direction above which a parameter is not observed
 PUSHED = 2.0  # times the required interval: with a wider interval it is not known whether the value exceeds the bound
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
@@ -42,7 +42,6 @@ WIDEN_BOUNDS = "widen the bounds in [parameters], or check the equations of the 
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
-MIN_CURVED_SINGULAR = 1e-12  # relative singular value below which a direction is not determined, and has no curvature
 
 
 class Identifiability(StrEnum):
@@ -103,7 +102,7 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
     """
     scaled = jacobian * width
     norms = np.linalg.norm(scaled, axis=0)
-    alive = norms > MIN_SENSITIVITY * max(float(norms.max(initial=0.0)), 1.0)
+    alive = norms > MIN_EXPLAINED * max(float(norms.max(initial=0.0)), 1.0)
     sd = np.full(len(width), np.inf)
     correlation = np.eye(len(width))
     if alive.any():
@@ -393,7 +392,7 @@ def linearisation_errors(objective: Objective, guess: Array, jacobian: Array) ->
         return np.zeros((count, 0))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     _, singular, directions = np.linalg.svd(np.linalg.qr(jacobian / size, mode="r"))
-    kept = singular > MIN_CURVED_SINGULAR * singular[0]
+    kept = singular > MIN_EXPLAINED * singular[0]
     steps = directions[kept] / singular[kept, None] / size
     around = np.concatenate([guess + steps, guess - steps, guess[None]])
     inside = np.clip(around, objective.low, objective.high)

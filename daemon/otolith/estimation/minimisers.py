@@ -17,7 +17,7 @@ from otolith.acquisition.window import Array
 from otolith.estimation.problem import AlgorithmName, SwarmOptions
 
 MAX_STEPS = 40
-FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-7, 1e-12, 1e12
+FIRST_DAMPING, MIN_DAMPING = 1e-7, 1e-12
 MIN_IMPROVEMENT = 1e-6  # least decrease of χ²; above χ² = 1e6, the share 1e-12 of χ²
 STALLED = 20  # generations without improvement after which a population ends
 IMPROVED = 0.9  # ratio of two squared costs, as of χ², that counts as an improvement
@@ -67,7 +67,7 @@ def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> Fi
         if _is_negligible(reached.chi_square, float(linear @ linear)):
             truncated = (step != 0.0) & ((trial <= objective.low) | (trial >= objective.high))
             converged = not truncated.any()
-            if converged or damping > MAX_DAMPING:
+            if converged or damping > 1.0 / MIN_DAMPING:
                 break
             damping = _increased(damping)  # a long step that a bound truncates may lead uphill
             continue
@@ -82,7 +82,7 @@ def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> Fi
         else:
             converged = chi_square - reached.chi_square <= MIN_IMPROVEMENT
             damping = _increased(damping)
-        if converged or damping > MAX_DAMPING:
+        if converged or damping > 1.0 / MIN_DAMPING:
             break
     guess, residuals, jacobian, chi_square = reached.guess, reached.residuals, reached.jacobian, reached.chi_square
     return FitResult(guess, residuals, jacobian, chi_square, evaluations, converged, reached.first)

@@ -36,7 +36,7 @@ MIN_CHANGE = 1.2  # ratio below which the window length stays as it is
 SHORTENED = 0.5  # ratio of window lengths after a window that the twin does not explain
 AMPLITUDE_BOUND = 10.0  # times the discovered amplitude
 INNER_BOUND = 3.0  # times the discovered inner parameter, up and down
-MIN_OUTSIDE = 5  # readings of a signal outside of a range in a row, from which on the equations do not hold
+MIN_RUN = 5  # readings of a signal in a row that are no wrong ones: outside of a range, of one value, without a command
 PHASE_BOUND = 4.0 * np.pi  # rad; every window brings the phase back between -pi and pi
 
 
@@ -322,7 +322,7 @@ def runs_outside(own: OperatingRange, window: Window) -> list[tuple[int, int, fl
     measured = np.flatnonzero(~window.missing_in(own.signal))
     readings = window.readings(own.signal)[measured]
     edges = np.concatenate([[0], measured[1:], [window.records]])
-    least = min(MIN_OUTSIDE, len(measured))
+    least = min(MIN_RUN, len(measured))
     runs = runs_of((readings < own.low) | (readings > own.high))
     return [
         (int(edges[first]), int(edges[last]), float(readings[first])) for first, last in runs if last - first >= least

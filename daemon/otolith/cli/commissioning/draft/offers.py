@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from otolith.acquisition.samples import MAD_TO_SD
 from otolith.acquisition.window import Array
 from otolith.cli.commissioning.draft.words import LEVELS
-from otolith.estimation.data_checks import MAD_TO_SD
 from otolith.estimation.objective import adc_step
 from otolith_drivers.units import is_unit
 
