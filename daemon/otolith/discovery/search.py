@@ -48,7 +48,7 @@ from otolith.estimation.information import Prior, extend_prior, forget_parameter
 from otolith.estimation.objective import Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, indices
-from otolith.estimation.timing import delayable, largest_delay, trial_delays
+from otolith.estimation.timing import DELAY_RATIO, delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.components import MAX_COMPONENTS
 from otolith.twin.definition import Parameter
@@ -165,7 +165,8 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     gains = screening.response.score_delays().gain
-    fitted += [*changing_commands(fitted[0], gains), *late_signals(fitted[0], gains)]
+    least = min(map(_chi_square, fitted))
+    fitted += [*changing_commands(fitted[0], gains), *late_signals(fitted[0], gains, least)]
     return fitted + noisier_signals(fitted[0], min(map(_chi_square, fitted)))
 
 
@@ -228,24 +229,31 @@ def _instead_of_components(item: FittedHypothesis, best: Fit) -> Proposal:
     return Proposal(item.hypothesis, item.problem, item.fit.prior, start)
 
 
-def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
+def late_signals(null: FittedHypothesis, gains: Array, least: float = np.inf) -> list[FittedHypothesis]:
     """Return the hypotheses that one signal is late or early against all others, for those of the largest ``gains``.
 
     A signal is early if all others are late by the same time. If only one other shows a delay at all, that one is late.
     A signal that shows none has a gain by chance: χ² of one degree of freedom times the variance that the null leaves.
+    One is left out if it is far worse than other hypotheses, of which the best leaves χ² of ``least``, and not nearly
+    right at any trial delay: between two of these, a late signal leaves at most that share of what the null leaves.
     """
-    least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
+    most = max(FAR_WORSE * least, (DELAY_RATIO - 1.0) ** 2 * null.chi_square) / null.fit.count
+    least_gain = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
     by_chance = DECISIVE * discount(null.chi_square, null.fit.count)
     may_be_early = sum(gain > by_chance for gain in gains.tolist()) > 2
-    return [
-        _late_signal(null, index, may_be_early=may_be_early)
+    late = (
+        _late_signal(null, index, most, may_be_early=may_be_early)
         for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist()
-        if gains[index] > least
-    ]
+        if gains[index] > least_gain
+    )
+    return [item for item in late if item is not None]
 
 
-def _late_signal(null: FittedHypothesis, index: int, *, may_be_early: bool) -> FittedHypothesis:
-    """Fit the delay of one signal: the best of a grid, then Gauss-Newton steps of the delay."""
+def _late_signal(null: FittedHypothesis, index: int, most: float, *, may_be_early: bool) -> FittedHypothesis | None:
+    """Fit the delay of one signal: the best of a grid, then Gauss-Newton steps of the delay.
+
+    None if the best of the grid leaves ``most`` per measured value, or more.
+    """
     window, names = null.fit.window, delayable(null.problem.base_model)
     limit = largest_delay(window.grid.length, window.sample_period)
     earliest = -limit if may_be_early else 0.0
@@ -259,7 +267,10 @@ def _late_signal(null: FittedHypothesis, index: int, *, may_be_early: bool) -> F
     periods = periods[periods * window.sample_period >= earliest]
     # Late by whole periods, regular samples stay in common records: else there would be twice as many.
     delays = (window.sample_period * np.unique(np.where(np.abs(periods) < 1.0, periods, np.rint(periods)))).tolist()
-    (best,) = fit_hypotheses([_best_of_grid(proposal, delays, window)], window)
+    left, first = _best_of_grid(proposal, delays, window)
+    if left >= most:
+        return None
+    (best,) = fit_hypotheses([first], window)
     for _ in range(DELAY_STEPS):
         ((_, delay),), score = best.problem.delays, delay_score(best.fit, names[index])
         if score.step**2 * score.information < MIN_DELAY_GAIN:
@@ -271,8 +282,8 @@ def _late_signal(null: FittedHypothesis, index: int, *, may_be_early: bool) -> F
     return best
 
 
-def _best_of_grid(proposal: Callable[[float], Proposal], delays: list[float], window: Window) -> Proposal:
-    """Return the proposal of the delay that leaves least per measured value.
+def _best_of_grid(proposal: Callable[[float], Proposal], delays: list[float], window: Window) -> tuple[float, Proposal]:
+    """Return the least χ² per measured value that a delay leaves, and the proposal of that delay.
 
     Every second one is tried, then the neighbours of the best. Parameters are not fitted: what they explain to first
     order is projected out.
@@ -285,7 +296,8 @@ def _best_of_grid(proposal: Callable[[float], Proposal], delays: list[float], wi
         return chi_square_of_parameters(fitted) / fitted.count
 
     at = min(range(0, len(delays), 2), key=unexplained)
-    return proposal(delays[min(range(max(at - 1, 0), min(at + 2, len(delays))), key=unexplained)])
+    best = min(range(max(at - 1, 0), min(at + 2, len(delays))), key=unexplained)
+    return unexplained(best), proposal(delays[best])
 
 
 def _chi_square(fitted: FittedHypothesis) -> float:
