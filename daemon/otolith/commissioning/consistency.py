@@ -20,7 +20,6 @@ from bisect import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from statistics import NormalDist
 
 import numpy as np
 
@@ -38,7 +37,7 @@ FACTOR_TOLERANCE = 0.01  # of the factor's logarithm
 MIN_REGIME = 4  # windows between two changes of the machine
 CHANGE_SIGNIFICANCE = 1e-6  # probability of a difference by chance, below which the machine has changed
 MAX_OUTLYING_SHARE = 0.2  # of the windows: more of them are no exceptions
-OUTLYING = -NormalDist().inv_cdf(CHANGE_SIGNIFICANCE)  # standard deviations from which on a window is an exception
+OUTLYING = 4.75  # standard deviations from which on a window is not one of the machine that the others show
 LAGS = 20  # of the autocorrelation, records
 MIN_RECORDS = 2 * LAGS  # of a window
 WHITE_SIGNIFICANCE = 1e-3  # probability of a result by chance, below which innovations are coloured, or a sign is wrong

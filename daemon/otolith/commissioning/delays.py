@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.commissioning.identification import MIN_RECORDS, IdentifiedNoise, identify_noise, with_initial_noise
+from otolith.commissioning.identification import IdentifiedNoise, identify_noise, with_initial_noise
 from otolith.commissioning.likelihood import FIRST_FITS, MAX_FIRST_COST, FittedWindow, Likelihood, Progress
 from otolith.estimation.evidence import DECISIVE
 from otolith.estimation.information import QUANTILE
@@ -32,6 +32,7 @@ SIGNIFICANCE = 0.01  # probability that a signal without a delay is given one, o
 NEGLIGIBLE_STEP = 0.05  # standard deviations: step of a delay after which the search has ended
 MAX_REFINEMENTS = 2  # of the delays with identified noise levels, and of these without the refined delays
 MAX_UNCERTAINTY = 0.5  # of the largest delay: standard deviation of a delay above which the data show nothing of it
+MIN_RECORDS = 8  # of a window
 
 UNOBSERVABLE = "its delay cannot be identified: it does not move, or no output depends on it"
 NO_DELAY = "no delay is significant; up to about {:.2g} ms could not be detected"

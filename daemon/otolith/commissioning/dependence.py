@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.commissioning.shared_fit import SharedFit
-from otolith.estimation.evidence import Elimination
+from otolith.commissioning.shared_fit import SharedFit, projected
 from otolith.twin.definition import Parameter
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
@@ -44,8 +43,11 @@ def responses(together: SharedFit, guess: Array, held: Sequence[str], names: Seq
     ``together`` has both as shared parameters, first the names and then those that are held.
     """
     count, free = len(together.scales), len(names)
+    slopes = np.array([scale.slope(float(number)) for scale, number in zip(together.scales, guess, strict=False)])
     _, jacobian = together.linearise(guess)
-    left = Elimination.of(jacobian[:, count:]).left(jacobian[:, :count] / together.slopes(guess))
+    own = jacobian[:, count:]
+    lengths = np.maximum(np.linalg.norm(own, axis=0), np.finfo(float).tiny)
+    left = projected(own / lengths, jacobian[:, :count] / slopes)
     sizes = np.maximum(np.linalg.norm(left[:, :free], axis=0), np.finfo(float).tiny)
     moved = -np.linalg.lstsq(left[:, :free] / sizes, left[:, free:], rcond=1e-9)[0] / sizes[:, None]
     return {name: moved[:, at] for at, name in enumerate(held)}

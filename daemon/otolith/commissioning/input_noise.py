@@ -19,7 +19,6 @@ from otolith.acquisition.window import Array, Window
 from otolith.commissioning.consistency import MIN_REGIME
 from otolith.commissioning.likelihood import Fits, FittedWindow
 from otolith.discovery.noise_hypothesis import MIN_NOISE_FACTOR, input_noise_bounds
-from otolith.estimation.data_checks import SECOND_DIFFERENCE_SD
 from otolith.estimation.evidence import CHANCE_DEVIATE, SIGNIFICANT_DEVIATE, Elimination
 from otolith.estimation.minimisers import continued
 from otolith.estimation.window_fit import ALONE_STEPS, Fit
@@ -27,6 +26,7 @@ from otolith.twin.definition import Input
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 DRAWS = 16  # of noise for each window of a record, by which the expected correlation is computed
+SECOND_DIFFERENCE_GAIN = np.sqrt(6.0)  # for white noise
 RUNNING_DRAWS = 4  # of noise for each window of a running twin: other windows have others
 SUMMED_EVERY = 8  # windows, of which one is always added
 SUMMED_RATIO = 1.2  # ratio of variances above which windows differ by more than they should: then each is added
@@ -172,7 +172,7 @@ def _fast(window: Window, values: Array) -> Array:
     offsets, fast = window.grid.offsets, np.zeros(len(values))
     share = (offsets[1:-1] - offsets[:-2]) / (offsets[2:] - offsets[:-2])
     fast[1:-1] = values[1:-1] - (1.0 - share) * values[:-2] - share * values[2:]
-    return np.asarray(fast / SECOND_DIFFERENCE_SD)
+    return np.asarray(2.0 * fast / SECOND_DIFFERENCE_GAIN)
 
 
 def _response_to(fit: FittedWindow, name: str) -> Callable[[Array], Array]:

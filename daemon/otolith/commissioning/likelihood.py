@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.evidence import MIN_EXPLAINED, LogEvidence, discount, is_explained, log_determinant
+from otolith.estimation.evidence import LogEvidence, discount, is_explained, log_determinant
 from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -34,6 +34,7 @@ MIN_LENGTH_RATIO = 0.1  # of two successive trials
 MIN_IMPROVEMENT = 0.05  # predicted decrease of the deviance below which the search ends
 # of deviance: 95 % point of ½χ²(0) + ½χ²(1), as a variance may not be negative
 SIGNIFICANT_LOSS = NormalDist().inv_cdf(0.95) ** 2
+MIN_EIGENVALUE = 1e-9  # of the largest one of the scaled Hessian: smaller directions do not move
 
 Progress = Callable[[str], None]
 
@@ -265,7 +266,7 @@ def _minimum_of_model(gradient: Array, hessian: Array, shares: Array) -> Array:
     # With hessian = RᵀR, the model is ½‖R·x - b‖² up to a constant, where b = R·shares - R⁻ᵀ·gradient.
     scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
     eigenvalues, directions = np.linalg.eigh(hessian / np.outer(scale, scale))
-    kept = eigenvalues > MIN_EXPLAINED * eigenvalues.max(initial=0.0)
+    kept = eigenvalues > MIN_EIGENVALUE * eigenvalues.max(initial=0.0)
     roots, directions = np.sqrt(eigenvalues[kept]), directions[:, kept]
     rows = roots[:, None] * directions.T
     return np.asarray(nnls(rows, rows @ (scale * shares) - (directions.T @ (gradient / scale)) / roots)[0] / scale)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.estimation.evidence import Elimination
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
@@ -78,10 +77,6 @@ class SharedFit:
         """Return those of the signals, s, as outputs and then inputs."""
         return guess[len(guess) - len(self._limits) :]
 
-    def slopes(self, guess: Array) -> Array:
-        """Return the derivatives of the shared values by the numbers that are searched."""
-        return np.array([scale.slope(float(number)) for scale, number in zip(self.scales, guess, strict=False)])
-
     def split(self, guess: Array) -> list[Array]:
         """Return the guess of each window."""
         count, guesses = len(self.scales), []
@@ -102,7 +97,7 @@ class SharedFit:
     def linearise(self, guess: Array) -> tuple[Array, Array]:
         """See :class:`otolith.estimation.minimisers.LeastSquares`."""
         count, residuals, rows, delays = len(self.scales), list[Array](), list[Array](), self.delays(guess)
-        slopes = self.slopes(guess)
+        slopes = [scale.slope(float(number)) for scale, number in zip(self.scales, guess, strict=False)]
         for number, (objective, own) in enumerate(zip(self._objectives, self.split(guess), strict=True)):
             errors, jacobian = objective.linearise(own)
             whole = np.zeros((len(errors), len(guess)))
@@ -130,10 +125,15 @@ def deviations(
     ``cost``. The one that the direction moves most comes first.
     """
     count = len(together.scales)
+    slopes = np.array(
+        [scale.slope(float(number)) for scale, number in zip(together.scales, result.guess, strict=False)]
+    )
     lengths = np.array(list(sizes.values()))
     # Per share of a value, so that directions can be compared.
-    jacobian = result.jacobian[:, :count] / together.slopes(result.guess) * lengths / max(cost, 1.0)
-    left = Elimination.of(result.jacobian[:, count:]).left(jacobian)
+    jacobian = result.jacobian[:, :count] / slopes * lengths / max(cost, 1.0)
+    own = result.jacobian[:, count:]
+    scale = np.maximum(np.linalg.norm(own, axis=0), np.finfo(float).tiny)
+    left = projected(own / scale, jacobian)
     normal = left.T @ left
     eigenvalues, directions = np.linalg.eigh(normal)
     variances = 1.0 / np.maximum(eigenvalues, 1e-12 * max(float(eigenvalues.max()), 1e-300))
@@ -145,6 +145,13 @@ def deviations(
     names = list(sizes)
     order = np.argsort(-weights, kind="stable")
     return sd, [names[at] for at in order if weights[at] > 0.1 * weights.max()]
+
+
+def projected(own: Array, columns: Array) -> Array:
+    """Return what no combination of the columns ``own`` explains of ``columns``."""
+    basis, sizes, _ = np.linalg.svd(own, full_matrices=False)
+    basis = basis[:, sizes > 1e-9 * sizes.max(initial=0.0)]
+    return np.asarray(columns - basis @ (basis.T @ columns))
 
 
 def size_of(parameter: Parameter, value: float) -> float:

@@ -34,11 +34,11 @@ from otolith.discovery.linear_response import (
 )
 from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
-from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE, MIN_EXPLAINED, Elimination
+from otolith.estimation.evidence import CHANCE_DEVIATE, DECISIVE, Elimination
 from otolith.estimation.information import initial_prior
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of
-from otolith.estimation.window_fit import AT_BOUND, Fit, fit
+from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.components import MAX_COMPONENTS, SourceKind, positions, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
@@ -48,7 +48,10 @@ MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
 MIN_LINE = NEIGHBOURS[-1] + 1  # spectral lines: least frequency of a sine with one phase that has all neighbours
 MIN_SHARE = 0.5  # of the best score: candidates with less are dropped, unless they are a line above the spectrum
+SHORTEST = 1e-300  # of a source within a window: the frequency of a sine in it stays finite
 MAX_CONCENTRATION = 0.5  # sum of the squared shares of information: one window alone would decide
+ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
+AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # of a running twin that are searched together, and records of all of them
 MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
 SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
@@ -188,7 +191,7 @@ class PooledResponse(ProjectedResponse):
             return form
         low, high = form.bounds
         shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
-        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).eps)), high))
+        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, SHORTEST)), high))
 
     def stands_out(self, guess: Guess) -> bool:
         """Whether a sine gains more than its neighbours in the spectrum.
@@ -379,7 +382,7 @@ def _amplitude_sd(values: Array, information: Array) -> tuple[float, float]:
     explained = float(mean @ information.sum(axis=0) @ mean)
     left, degrees = values - mean, phases * (windows - 1.0)
     variance = float(np.einsum("wp,wpq,wq->", left, information, left)) / degrees
-    variance = max(variance, MIN_EXPLAINED**2 * explained)
+    variance = max(variance, ROUNDING**2 * explained)
     if not explained:
         return np.inf, 1.0
     chance = float(fdtrc(phases, degrees, explained / phases / variance))

@@ -11,7 +11,7 @@ from otolith.commissioning.dependence import Dependence, dependences, is_count, 
 from otolith.commissioning.identification import sample_noise, with_initial_noise
 from otolith.commissioning.likelihood import Progress, with_levels
 from otolith.commissioning.shared_fit import DETERMINED, SharedFit, SharedScale, deviations, size_of
-from otolith.estimation.evidence import CERTAIN_DEVIATE, DECISIVE, SIGNIFICANT_DEVIATE, STRUCTURE
+from otolith.estimation.evidence import DECISIVE, SIGNIFICANT_DEVIATE, STRUCTURE
 from otolith.estimation.global_search import LEVELS
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.minimisers import MAX_STEPS, FitResult, gauss_newton
@@ -25,6 +25,7 @@ from otolith_drivers.units import is_one_in_si
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 QUIETER = 0.03  # times the process noise: a second fit, whose values are the same if the twin lacks nothing
 MIN_SHARE = 0.9  # of the variance of an output that the twin explains without being corrected
+MOVING = 10.0  # standard deviations of its noise by which an output moves, so that its variance can be explained
 WIDER_INTERVAL = 1.5  # times the interval of a parameter that is less than determined: accepted in the next fits
 PHASES = 8  # of a sine that are tried in each window
 
@@ -175,7 +176,7 @@ class ValueSearch:
                 values = window.column(name)[~window.missing_in(name)]
                 variance[at] += float(((values - values.mean()) ** 2).sum()) / level**2 if len(values) else 0.0
                 counts[at] += len(values)
-        moves = variance > CERTAIN_DEVIATE**2 * counts
+        moves = variance > MOVING**2 * counts
         shares = {name: float(1.0 - squares[at] / variance[at]) for at, name in enumerate(names) if moves[at]}
         return shares, tuple(misfits)
 
