@@ -237,16 +237,16 @@ def late_signals(null: FittedHypothesis, gains: Array, least: float = np.inf) ->
     One is left out if it is far worse than other hypotheses, of which the best leaves χ² of ``least``, and not nearly
     right at any trial delay: between two of these, a late signal leaves at most that share of what the null leaves.
     """
-    most = max(FAR_WORSE * least, (DELAY_RATIO - 1.0) ** 2 * null.chi_square) / null.fit.count
     least_gain = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
     by_chance = DECISIVE * discount(null.chi_square, null.fit.count)
     may_be_early = sum(gain > by_chance for gain in gains.tolist()) > 2
-    late = (
-        _late_signal(null, index, most, may_be_early=may_be_early)
-        for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist()
-        if gains[index] > least_gain
-    )
-    return [item for item in late if item is not None]
+    late = list[FittedHypothesis]()
+    for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist():
+        best = min([least, *map(_chi_square, late)])
+        most = max(FAR_WORSE * best, (DELAY_RATIO - 1.0) ** 2 * null.chi_square) / null.fit.count
+        item = _late_signal(null, index, most, may_be_early=may_be_early) if gains[index] > least_gain else None
+        late += [] if item is None else [item]
+    return late
 
 
 def _late_signal(null: FittedHypothesis, index: int, most: float, *, may_be_early: bool) -> FittedHypothesis | None:
