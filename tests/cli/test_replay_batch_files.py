@@ -36,14 +36,16 @@ def found(machines: list[LoadedMachine], folder: Path, *data: Path) -> dict[str,
 def test_files_of_several_machines_are_found_by_folder_and_name(
     machine: LoadedMachine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    own = "hall.press-20260101T000000-1.rrd"
+    own, begun = "hall.press-20260101T000000-1.rrd", "hall.press-20260101T010000-1.rrd"
+    made(tmp_path, own.replace(".rrd", ".samples.parquet"), begun, begun.replace(".rrd", ".samples/000001.parquet"))
+    made(tmp_path, alone := "hall.press-20260101T020000-1.samples.parquet")
     made(tmp_path, "pump/2.csv", "pump/1.csv", "hall.saw/1.csv", "saw.csv", "saw.2026-01-02.csv", own, "notes.txt")
     made(tmp_path, ".hidden/1.csv", "pump/.hidden", "other/1.csv")
     machines = [named(machine, name) for name in ("pump", "saw", "press")]
     assert found(machines, tmp_path) == {
         "hall.pump": ["pump/1.csv", "pump/2.csv"],
         "hall.saw": ["saw.2026-01-02.csv", "saw.csv", "hall.saw/1.csv"],
-        "hall.press": [own],
+        "hall.press": [own, begun, alone],
     }
     assert_says(caplog.text, "2 files", str(tmp_path / "notes.txt"), str(tmp_path / "other" / "1.csv"), "'pump.'")
 

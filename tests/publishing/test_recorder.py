@@ -14,15 +14,19 @@ from hypothesis import strategies as st
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.recorder import Recording
+from otolith.publishing.recorder import Recording, RotatedRecording
 from otolith.runtime.replay import open_recorded
+from otolith.storage.recording_files import RecordingBudget, RecordingFolder
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import recording as recording_module
-from otolith_drivers.replay.recording import RecordingReader
+from otolith_drivers.replay.recording import open_recording
+from otolith_drivers.replay.sample_names import parts_folder, whole_file
 from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
+from tests.drivers.replay.packed_windows import earlier_recording
 from tests.messages import assert_each_says, assert_refuses, raises_saying
+from tests.publishing.test_recording_size import noise
 from tests.variants import often
 
 UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}
@@ -91,7 +95,7 @@ def test_a_replayed_recording_gives_the_same_reports(
     first, again = reports(tmp_path / "data.csv", capsys), reports(path, capsys)
     assert {document.window.quality.verdict for document in first} == {"good", "bad"}
     assert_same(first, again, share=0.1)
-    assert "windows that were bad when they were recorded, left out: 1" in summed_up(path, capsys)
+    assert f"windows that were bad when they were recorded, left out: {RECORDS}" in summed_up(path, capsys)
 
 
 def test_the_delay_of_a_signal_is_subtracted_once(
@@ -130,19 +134,55 @@ def test_a_recording_of_a_replay_has_the_same_samples(tmp_path: Path, recording:
             assert all(np.array_equal(left.columns[name], right.columns[name]) for name in UNITS)
 
 
-def test_a_recording_optimised_by_rerun_is_read(
-    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    better = tmp_path / "better.rrd"
-    subprocess.run([RERUN, "rrd", "optimize", recording, "-o", better], capture_output=True, check=True)
-    assert reports(better, capsys) == reports(recording, capsys)
+def test_a_recording_of_an_earlier_version_is_read_also_optimised_by_rerun(tmp_path: Path) -> None:
+    """It has its samples in itself."""
+    own, better = earlier_recording(tmp_path / "own.rrd"), tmp_path / "better.rrd"
+    subprocess.run([RERUN, "rrd", "optimize", own, "-o", better], capture_output=True, check=True)
+    signals = np.random.default_rng(7)  # as tests/publishing/test_recording_size.py makes them
+    signals.normal()
+    expected = signals.normal(size=(RECORDS, 2))
+    for path in (own, better):
+        with open_recording(path, UNITS) as reader:
+            read = list(reader.chunks())
+            assert reader.warnings() == []
+        assert sum(len(rows.times) for rows in read) == 3 * RECORDS
+        for place, name in enumerate(("i", "omega")):
+            assert np.array_equal(read[0].columns[name][:RECORDS], expected[:, place])
+
+
+def test_a_recording_without_its_samples_says_where_they_are(tmp_path: Path, recording: Path) -> None:
+    alone = tmp_path / "alone.rrd"
+    alone.write_bytes(recording.read_bytes())
+    with raises_saying(ConfigurationError, "alone.rrd", "alone.samples.parquet", "beside"):
+        open_recording(alone, UNITS)
+    samples = tmp_path / "alone.samples.parquet"
+    samples.write_bytes(whole_file(recording).read_bytes())
+    alone.unlink()
+    with open_recording(samples, UNITS) as reader:
+        assert sum(len(rows.times) for rows in reader.chunks()) == 5 * RECORDS
+
+
+def test_what_a_killed_recorder_left_is_one_file_with_the_next_one(tmp_path: Path, machine: LoadedMachine) -> None:
+    folder = RecordingFolder(tmp_path / "recordings", "site.motor", RecordingBudget(1e9, 1e9, 1e9, 1e9))
+    source, begin, (one, other, *_) = machine.recorded(Sampling.TRUE), 1_700_000_000.0, noise(3)
+    killed = RotatedRecording(folder.new_path(begin), source, folder, begin)
+    killed.add(one, begin)
+    killed.write()
+    killed.add(other, begin)  # it is lost
+    following = RotatedRecording(folder.new_path(begin + 60.0), source, folder, begin + 60.0)
+    assert not parts_folder(killed.path).exists()
+    assert whole_file(killed.path).stat().st_mode & 0o777 == 0o640
+    with open_recording(killed.path, UNITS) as reader:
+        assert sum(len(rows.times) for rows in reader.chunks()) == RECORDS
+    assert parts_folder(following.path).stat().st_mode & 0o777 == 0o750
+    following.add(other, begin + 60.0)
+    following.close()
+    assert sorted(path.suffix for path in folder._folder.iterdir()) == [".parquet", ".parquet", ".rrd", ".rrd"]
 
 
 @pytest.mark.full
-def test_an_unclosed_recording_is_read_a_torn_one_repaired(
-    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    killed, torn = tmp_path / "killed.rrd", tmp_path / "torn.rrd"
+def test_an_unclosed_recording_is_read(tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    killed = tmp_path / "killed.rrd"
     program = (
         "import os, sys; from pathlib import Path\n"
         "import otolith.publishing.recorder as module, otolith.cli.replay as replaying\n"
@@ -158,20 +198,28 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
     )
     assert reports(killed, capsys) == reports(recording, capsys)
     assert "never closed by the recorder" in summed_up(killed, capsys)
-    torn.write_bytes(recording.read_bytes()[:-20_000])
-    with pytest.raises(ConfigurationError, match=r"torn\.rrd: damaged, .*'rerun rrd optimize --continue") as info:
-        summed_up(torn, capsys)
+
+
+def test_a_torn_recording_of_an_earlier_version_says_how_it_is_repaired(tmp_path: Path) -> None:
+    torn = earlier_recording(tmp_path / "torn.rrd")
+    torn.write_bytes(torn.read_bytes()[:-20_000])
+    with (
+        pytest.raises(ConfigurationError, match=r"torn\.rrd: damaged, .*'rerun rrd optimize --continue") as info,
+        open_recording(torn, UNITS) as reader,
+    ):
+        list(reader.chunks())
     command = str(info.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
     subprocess.run([RERUN.with_name(command.split()[0]), *command.split()[1:]], capture_output=True, check=True)
-    assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
+    with open_recording(tmp_path / "whole.rrd", UNITS) as reader:
+        assert sum(len(rows.times) for rows in reader.chunks()) >= RECORDS
 
 
 def test_a_recording_that_is_still_being_written_is_no_damage(recording: Path) -> None:
     """Its recorder may have written all so far, but has not closed it."""
-    with RecordingReader(recording, UNITS) as reader:
+    with open_recording(recording, UNITS) as reader:
         reader._closed = False
         assert "never closed" in " ".join(reader.warnings())
-    with recording.open("ab"), RecordingReader(recording, UNITS) as reader:
+    with recording.open("ab"), open_recording(recording, UNITS) as reader:
         assert reader.warnings() == []
         reader._closed = False
         (line,) = reader.warnings()
@@ -185,7 +233,7 @@ def test_ctrl_c_does_not_call_a_recording_damaged(tmp_path: Path, monkeypatch: p
     path = tmp_path / "empty.rrd"
     path.touch()
     with pytest.raises(ConfigurationError, match="another group"):
-        RecordingReader(path, {})
+        open_recording(path, {})
 
 
 CHILD_IN_OTHER_GROUP = """
@@ -196,16 +244,18 @@ sys.stdout.buffer.write(struct.pack("<cIf", b"F", len(text), 0.0) + text)
 
 
 def test_a_child_that_aborts_is_a_damaged_file_and_costs_nothing_else(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    recording = earlier_recording(tmp_path / "run.rrd")
     monkeypatch.setattr(recording_module, "READ_IN_CHILD", [sys.executable, "-c", "import os; os.abort()"])
     with raises_saying(ConfigurationError, "run.rrd", "aborts", "rerun rrd optimize"):
-        RecordingReader(recording, UNITS)
+        open_recording(recording, UNITS)
 
 
-def test_a_recording_is_read_by_one_child_which_ends_with_its_reader(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_recording_of_an_earlier_version_is_read_by_one_child_which_ends_with_its_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    recording = earlier_recording(tmp_path / "run.rrd")
     started: list[subprocess.Popen[bytes]] = []
 
     class Counted(subprocess.Popen[bytes]):
@@ -214,9 +264,9 @@ def test_a_recording_is_read_by_one_child_which_ends_with_its_reader(
             started.append(self)
 
     monkeypatch.setattr(recording_module.subprocess, "Popen", Counted)  # type: ignore[attr-defined]
-    with RecordingReader(recording, UNITS) as reader:
+    with open_recording(recording, UNITS) as reader:
         (child,) = started
-        assert sum(len(rows.times) for rows in reader.chunks()) == 5 * RECORDS
+        assert sum(len(rows.times) for rows in reader.chunks()) == 3 * RECORDS
         assert reader.progress == 1.0
     assert child.returncode is not None
     assert len(started) == 1
@@ -226,13 +276,13 @@ def test_a_recording_is_read_by_one_child_which_ends_with_its_reader(
 def test_a_recording_of_another_application_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.rrd"
     with pytest.raises(ConfigurationError, match="No such file"):
-        RecordingReader(path, UNITS)
+        open_recording(path, UNITS)
     stream = rr.RecordingStream("somebody_else", recording_id="x")
     stream.save(path)
     stream.log("signals/i", rr.Scalars([1.0]))
     stream.disconnect()
     with raises_saying(ConfigurationError, "'somebody_else'", "Otolith"):
-        RecordingReader(path, UNITS)
+        open_recording(path, UNITS)
 
 
 @pytest.mark.parametrize(
@@ -247,15 +297,15 @@ def test_a_recording_whose_times_mean_something_unknown_is_refused(tmp_path: Pat
     stream.log("signals/i", rr.Scalars([1.0]))
     stream.disconnect()
     with raises_saying(ConfigurationError, "/times", "mean"):
-        RecordingReader(path, {"i": "A"})
+        open_recording(path, {"i": "A"})
 
 
 def test_the_error_names_a_signal_that_was_not_recorded(recording: Path) -> None:
     with raises_saying(ConfigurationError, "'p' (Pa)", "T_load, V_a, i, omega"):
-        RecordingReader(recording, {**UNITS, "p": "Pa"})
+        open_recording(recording, {**UNITS, "p": "Pa"})
     with raises_saying(ConfigurationError, "'i'", "'A'", "'V'"):
-        RecordingReader(recording, {**UNITS, "i": "V"})
-    with RecordingReader(recording, {**UNITS, "i": "mA"}) as milli, RecordingReader(recording, UNITS) as plain:
+        open_recording(recording, {**UNITS, "i": "V"})
+    with open_recording(recording, {**UNITS, "i": "mA"}) as milli, open_recording(recording, UNITS) as plain:
         ampere = np.concatenate([part.columns["i"] for part in plain.chunks()])
         assert np.concatenate([part.columns["i"] for part in milli.chunks()]) == pytest.approx(1e3 * ampere)
 
@@ -269,16 +319,16 @@ def check_damaged(tmp_path: Path, scenario: MotorScenario, changes: list[tuple[f
     whole = tmp_path / "whole.rrd"
     if not whole.exists():
         record(tmp_path, recorded(scenario)[: 2 * RECORDS], whole.name)
-    content = bytearray(whole.read_bytes())
+    content = bytearray(whole_file(whole).read_bytes())
     for place, value in changes:
         content[int(place * len(content))] = value
-    path = tmp_path / "damaged.rrd"
+    path = whole_file(tmp_path / "damaged.rrd")
     path.write_bytes(content[: int(end * len(content))])
     try:
-        with RecordingReader(path, UNITS) as damaged:
+        with open_recording(path, UNITS) as damaged:
             read = [len(part.times) for part in damaged.chunks()]
             assert all(read)
-            assert sum(read) == 2 * RECORDS or damaged.bad or damaged.warnings()
+            assert sum(read) == 2 * RECORDS or damaged.warnings()
     except ConfigurationError as error:
         assert_refuses(error, path)
 
@@ -330,14 +380,13 @@ def test_the_recorder_does_without_pandas(tmp_path: Path) -> None:
 def test_a_recording_without_a_window_yet_is_not_said_to_lack_a_signal(tmp_path: Path, machine: LoadedMachine) -> None:
     """A daemon that began less than a minute ago has written what the records will mean, and none of them."""
     path, still_open = tmp_path / "run.rrd", tmp_path / "open.rrd"
-    recording = Recording(path, machine.recorded(Sampling.TRUE))
-    recording.close()
-    whole = path.read_bytes()
-    still_open.write_bytes(whole[: whole.rindex(b"RRF2")])  # without the footer
+    Recording(path, machine.recorded(Sampling.TRUE)).close()
+    being_written = Recording(still_open, machine.recorded(Sampling.TRUE))
     for file, state in ((path, "ended"), (still_open, "minutes")):
         with pytest.raises(ConfigurationError) as refused:
-            RecordingReader(file, UNITS)
+            open_recording(file, UNITS)
         assert_each_says([str(refused.value)], (file.name, "window", state))
         assert "V_a" not in str(refused.value)
     with raises_saying(ConfigurationError, "'p' (Pa)", "T_load, V_a, i, omega"):
-        RecordingReader(path, {"p": "Pa"})
+        open_recording(path, {"p": "Pa"})
+    being_written.close()

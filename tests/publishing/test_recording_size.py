@@ -14,8 +14,9 @@ from rerun.error_utils import RerunWarning
 from otolith.health.schema import EventChange, Report, Traces
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.recorder import BATCH_WINDOWS, FULL_CURVES, Recording
+from otolith.storage.recording_files import size_of
 from otolith_drivers.base import Sampling
-from otolith_drivers.replay.recording import RecordingReader
+from otolith_drivers.replay.recording import open_recording
 from tests.cli.replays import MACHINE, PERIOD, RECORDS
 from tests.health.test_events import assessed, report
 
@@ -66,7 +67,7 @@ def test_a_recording_is_not_much_larger_than_its_samples(tmp_path: Path, machine
     for one in noise(windows):
         recording.add(one)
     recording.close()
-    assert (tmp_path / "run.rrd").stat().st_size <= 1.3 * windows * RECORDS * len(UNITS) * 8
+    assert size_of(tmp_path / "run.rrd") <= 1.3 * windows * RECORDS * len(UNITS) * 8
 
 
 def test_curves_have_the_extremes_and_the_begin_all_records(tmp_path: Path, machine: LoadedMachine) -> None:
@@ -84,7 +85,7 @@ def test_curves_have_the_extremes_and_the_begin_all_records(tmp_path: Path, mach
     for one in reports[FULL_CURVES:]:
         measured = one.traces.measured[:, 0]
         assert {measured.min(), measured.max()} <= set(shown[:, 0])
-    with RecordingReader(path, UNITS) as reader:
+    with open_recording(path, UNITS) as reader:
         samples = np.concatenate([part.columns["omega"] for part in reader.chunks()])
     assert np.array_equal(samples, np.concatenate([one.traces.measured[:, 1] for one in reports]))
 

@@ -19,7 +19,7 @@ from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.recorder_supervisor import FOLDER_TIMEOUT, MIN_DEATHS, RECORDER_TIMEOUT, RecorderSupervisor
 from otolith.storage.recording_files import RecordingFile, RecordingFolder
 from otolith_drivers.errors import ServiceError
-from otolith_drivers.replay.recording import RecordingReader
+from otolith_drivers.replay.recording import open_recording
 from tests.conftest import EXAMPLES
 from tests.messages import assert_says
 from tests.publishing.test_recording_size import UNITS, noise
@@ -77,8 +77,8 @@ def test_a_stopped_recorder_is_killed_and_counted(
     supervisor.offer(first, 200.0)
     wait_for(answered(supervisor, 201.0))
     supervisor.stop(10.0)
-    _, second = sorted((tmp_path / "recordings").iterdir(), key=lambda path: path.stat().st_mtime_ns)
-    with RecordingReader(second, UNITS) as reader:
+    _, second = sorted((tmp_path / "recordings").glob("*.rrd"), key=lambda path: path.stat().st_mtime_ns)
+    with open_recording(second, UNITS) as reader:
         assert sum(len(part.times) for part in reader.chunks()) == 200
 
 
@@ -254,7 +254,7 @@ def test_machines_share_a_process_and_a_disk_that_fails_concerns_one_of_them(
     for supervisor in supervisors:
         wait_for(answered(supervisor, 2.0))
     assert whole.child.starts == 1
-    (path,) = (tmp_path / "recordings-0").iterdir()
+    (path,) = (tmp_path / "recordings-0").glob("*.rrd")
     path.unlink()  # the size of the file is looked at for each window
     first.offer(other, 3.0)
     second.offer(other, 3.0)
@@ -269,6 +269,6 @@ def test_machines_share_a_process_and_a_disk_that_fails_concerns_one_of_them(
     poll(first, 6.0)
     assert (first.restarts, first.dropped, second.restarts, second.dropped) == (1, 2, 0, 0)
     whole.stop(10.0)
-    (kept,) = (tmp_path / "recordings-1").iterdir()
-    with RecordingReader(kept, UNITS) as reader:
+    (kept,) = (tmp_path / "recordings-1").glob("*.rrd")
+    with open_recording(kept, UNITS) as reader:
         assert sum(len(part.times) for part in reader.chunks()) == 400

@@ -21,7 +21,9 @@ from otolith.storage.recording_files import (
     RecordingFolder,
     expendable,
     recording_file,
+    size_of,
 )
+from otolith_drivers.replay.sample_names import parts_folder, whole_file
 
 NOW, HOUR = 1_800_000_000.0, 3600.0
 BUDGET = RecordingBudget(max_bytes=1000, max_age=14 * DAY, rotate_bytes=100, rotate_age=HOUR)
@@ -182,6 +184,30 @@ def test_the_oldest_files_are_deleted_while_the_disk_fills_from_elsewhere(
         assert (missing <= 0) == (usage(tmp_path).free >= reserve)
         assert missing <= 0 or left == paths[-1:]
     assert left == paths[-1:]
+
+
+def test_samples_are_counted_marked_and_deleted_with_their_recording(tmp_path: Path) -> None:
+    """Also those that are left alone, and the parts of a recording that is being written."""
+    folder = folder_of(tmp_path, RecordingBudget(450, 14 * DAY, 100, HOUR))
+    paths = [written(folder, NOW + hours * HOUR, 50) for hours in range(5)]
+    for path in paths[:-1]:
+        whole_file(path).write_bytes(bytes(100))
+    parts_folder(paths[-1]).mkdir()
+    for number in range(2):
+        (parts_folder(paths[-1]) / f"{number}.parquet").write_bytes(bytes(40))
+    paths[0].unlink()
+    for path in paths[:-1]:
+        os.utime(whole_file(path), (path.stat().st_mtime if path.exists() else NOW,) * 2)
+    assert [file.size for file in folder.files()] == [100, 150, 150, 150, 130]
+    current = folder.mark(NOW + 4 * HOUR, paths[-1])
+    assert current.name.endswith("-event.rrd")
+    assert size_of(current) == 130
+    assert not parts_folder(paths[-1]).exists()
+    folder.make_room(NOW + 4 * HOUR, current)
+    assert [file.path for file in folder.files()] == [*paths[2:4], current]
+    assert not whole_file(paths[0]).exists()
+    assert not whole_file(paths[1]).exists()
+    assert folder.new_path(NOW + 4 * HOUR).name.count("-") == paths[-1].name.count("-") + 1  # its name is taken
 
 
 def test_the_group_may_read_the_folder(tmp_path: Path) -> None:

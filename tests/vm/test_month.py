@@ -19,7 +19,7 @@ from otolith.storage.history import DAY, HOUR
 from otolith.storage.history_writer import Bounds
 from otolith.storage.recording_files import GIGABYTE, MEGABYTE, MIN_FREE_BYTES, RecordingBudget, RecordingFolder
 from otolith_drivers.base import Sampling
-from otolith_drivers.replay.recording import RecordingReader
+from otolith_drivers.replay.recording import open_recording
 from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, document
 from tests.storage.test_history import Simulated
@@ -104,7 +104,7 @@ def test_the_newest_data_and_all_events_stay(disk: Path, caplog: pytest.LogCaptu
         f"{len(files)} recordings of {size:.0f} MB, {marked} around events; history {history.largest / MEGABYTE:.0f} MB"
     )
     for file in files:
-        with RecordingReader(file.path, UNITS) as opened:
+        with open_recording(file.path, UNITS) as opened:
             assert opened.warnings() == []
             newest = [part.columns["omega"] for part in opened.chunks()][-1]
     assert np.array_equal(newest, last.traces.measured[-len(newest) :, 1])

@@ -25,6 +25,7 @@ from otolith.runtime.segment import first_state
 from otolith.storage.recording_files import recording_file
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError, counted, some_names
+from otolith_drivers.replay.sample_names import FOLDER, SAMPLES, viewing_file
 
 if TYPE_CHECKING:
     from otolith.runtime.batch.cluster import ClusterAccess
@@ -168,14 +169,20 @@ def _listed(path: Path) -> list[Path]:
         return [path]
     inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]
     deeper = [file for item in inside if item.is_dir() for file in sorted(item.iterdir()) if file.is_file()]
-    return [item for item in inside if item.is_file()] + [file for file in deeper if not file.name.startswith(".")]
+    files = [item for item in inside if item.is_file()] + [file for file in deeper if not file.name.startswith(".")]
+    return [file for file in files if not _is_of_another(file)]
+
+
+def _is_of_another(file: Path) -> bool:
+    """Whether a file has the samples of a recording that is listed as well, or a part of them."""
+    return file.parent.name.endswith(FOLDER) or (file.name.endswith(SAMPLES) and viewing_file(file).exists())
 
 
 def _owner(file: Path, under: Path, names: dict[str, str]) -> str | None:
     """Return the machine of a file that was found ``under`` a folder; None if its name does not say it."""
     if file.parent != under and (owner := names.get(file.parent.name)) is not None:
         return owner
-    if (recording := recording_file(file)) is not None and recording.key in names:
+    if (recording := recording_file(viewing_file(file))) is not None and recording.key in names:
         return names[recording.key]
     parts = file.name.split(".")
     return names.get(".".join(parts[:2])) or names.get(parts[0])

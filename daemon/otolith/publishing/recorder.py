@@ -1,17 +1,16 @@
 """The recorder process: writes reports and their traces into Rerun recordings.
 
 It runs beside the daemon, so that neither disk nor viewer can delay acquisition. Some windows are written together, in
-one ``send_columns`` call per entity, because each call costs a kilobyte. ``samples`` has all measured records, packed,
-for a replay; the curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
+one ``send_columns`` call per entity, because each call costs a kilobyte. All measured records are in Parquet files
+beside the recording; its curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
 """
 
-import json
 import math
 import re
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Verdict
+from otolith.exchange.identifiers import identifiers
 from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, Report, ReportDocument, Status
 from otolith.health.text import (
@@ -48,15 +48,16 @@ from otolith.storage.recording_files import (
     Opened,
     RecordingFolder,
     shortage_of,
+    size_of,
 )
 from otolith_drivers import keep_pandas_out
 from otolith_drivers.grammars.markdown import markdown_text
 from otolith_drivers.outside_text import visible
-from otolith_drivers.replay.recording import packed
+from otolith_drivers.replay.sample_files import GOOD, TIME, SampleWriter, TimesRecord, unite
+from otolith_drivers.replay.sample_names import parts_folder
 from otolith_drivers.units import equation_text, quantity_text
 
-TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
-SAMPLES, LOG, EVENTS, REPORT, OPERATOR = "samples", "log", "events", "report", "operator"  # entities
+LOG, EVENTS, REPORT, OPERATOR = "log", "events", "report", "operator"  # entities
 Times = NDArray[np.int64]  # ns
 INTERVAL, ESTIMATE_WIDTHS = ["95 %", "95 %"], [1.0, 1.0, 2.5]  # names; widths of the three lines, points
 
@@ -101,6 +102,8 @@ def main(connection: Any) -> None:
         with ExitStack() as closing:
             for recording in recordings.values():
                 closing.callback(recording.close)
+            for recording in recordings.values():  # before any is closed, which takes longer
+                closing.callback(recording.write)
 
 
 def _recorded(
@@ -138,7 +141,8 @@ class RotatedRecording:
         self._folder = folder
         self._begin = self._checked_at = now
         self._marked_until = -math.inf
-        self._recording = Recording(path, source)
+        self._unite_others()
+        self._recording = Recording(path, source, None if folder is None else FILE_MODE)
         self._set_mode()
 
     @property
@@ -151,7 +155,7 @@ class RotatedRecording:
         if self._folder is None:
             self._recording.add(report)
             return
-        if self._folder.budget.is_full(now - self._begin, self.path.stat().st_size):
+        if self._folder.budget.is_full(now - self._begin, size_of(self.path)):
             is_marked = now < self._marked_until <= now + EVENT_MARGIN  # not if the clock was set back meanwhile
             self.path, self._begin = self._folder.new_path(now, marked=is_marked), now
             self._recording.open(self.path)
@@ -159,6 +163,7 @@ class RotatedRecording:
         if announcements(report.document):
             self._marked_until = now + EVENT_MARGIN
             self.path = self._folder.mark(now, self.path)
+            self._recording.renamed(self.path)
         self._recording.add(report)
 
     def has_room(self, now: float) -> bool:
@@ -171,9 +176,20 @@ class RotatedRecording:
         self._checked_at = now
         return self._folder.make_room(now, self.path) <= 0
 
+    def write(self) -> None:
+        """Write the windows that wait."""
+        self._recording.write()
+
     def close(self) -> None:
         """Write everything out."""
         self._recording.close()
+
+    def _unite_others(self) -> None:
+        """Make one file each of the samples that a recorder left which was killed."""
+        for file in () if self._folder is None else self._folder.files():
+            if file.path != self.path and parts_folder(file.path).exists():
+                with suppress(OSError):  # the disk is full: they can be read as they are
+                    unite(file.path)
 
     def _set_mode(self) -> None:
         if self._folder is not None:
@@ -181,10 +197,12 @@ class RotatedRecording:
 
 
 class Recording:
-    """A stream of windows into ``.rrd`` files, one after the other."""
+    """A stream of windows into ``.rrd`` files, one after the other, and their samples into Parquet files."""
 
-    def __init__(self, path: Path, source: RecordedMachine) -> None:
-        self._source = source
+    def __init__(self, path: Path, source: RecordedMachine, mode: int | None = None) -> None:
+        """``mode`` is that of the files with samples."""
+        self._source, self._mode = source, mode
+        self._samples: SampleWriter | None = None
         self._stream = rr.RecordingStream(APPLICATION, recording_id=re.sub(r"\W+", "_", source.title))
         self._stream.set_log_time_enabled(False)
         self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
@@ -197,8 +215,9 @@ class Recording:
 
     def open(self, path: Path) -> None:
         """Finish the present file, and go on in the file ``path``."""
-        self.write()
+        self._close_samples()
         self._stream.save(path)
+        self._samples = self._new_samples(path)
         self._stream.log_file_from_path(layout_file(self._source))
         self._log_static()
         self.waiting, self._full_curves = 0, FULL_CURVES
@@ -207,13 +226,22 @@ class Recording:
         self._statuses: object = None
         self._states, self._styled = {}, set()
 
+    def _new_samples(self, path: Path) -> SampleWriter:
+        source, twin = self._source, self._source.twin
+        units = {name: twin.unit_of(name) for name in twin.signals}
+        meaning = TimesRecord(sampling=source.sampling, delays=dict(source.delays), signals=units)
+        headers = identifiers(units, str, {TIME, GOOD})  # a temperature may have any name
+        return SampleWriter(path, meaning, list(headers.values()), {"title": source.title}, self._mode)
+
+    def renamed(self, path: Path) -> None:
+        """Go on with the present file under another name."""
+        if self._samples is not None:
+            self._samples.recording = path
+
     def _log_static(self) -> None:
         """Log what each file must have: names, units, and what the times mean."""
         source, twin = self._source, self._source.twin
         self._stream.send_recording_name(source.title)
-        units = {name: twin.unit_of(name) for name in twin.signals}
-        times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays), "signals": units})
-        self._stream.log(TIMES, rr.TextDocument(times), static=True)
         for signal in twin.inputs:
             self._style(f"signals/{signal.name}", [named_with_unit(f"{signal.name} measured", signal.unit)], [MEASURED])
         for output in twin.outputs:
@@ -242,6 +270,8 @@ class Recording:
 
     def write(self) -> None:
         """Write the windows that wait."""
+        if self._samples is not None:
+            self._samples.save()
         self._add_texts()
         for entity, rows in self._rows.items():
             times = np.concatenate([times for times, _ in rows]).astype("datetime64[ns]")
@@ -252,8 +282,13 @@ class Recording:
 
     def close(self) -> None:
         """Write everything out."""
-        self.write()
+        self._close_samples()
         self._stream.disconnect()
+
+    def _close_samples(self) -> None:
+        self.write()
+        if self._samples is not None:
+            self._samples.close()
 
     def _add_document(self, document: ReportDocument) -> None:
         window = document.window
@@ -326,8 +361,8 @@ class Recording:
         measured = {name: traces.driving[:, column] for column, name in enumerate(traces.inputs)}
         measured |= {name: traces.measured[:, column] for column, name in enumerate(traces.outputs)}
         good = window.quality.verdict is Verdict.GOOD
-        packet = packed(times, [measured[name] for name in self._source.twin.signals], good=good)
-        self._rows[SAMPLES].append((np.array([round(window.start * 1e9)]), packet))
+        assert self._samples is not None  # noqa: S101 - for mypy
+        self._samples.add(times, [measured[name] for name in self._source.twin.signals], good=good)
 
         predicted = np.full(traces.measured.shape, math.nan) if traces.predicted is None else traces.predicted
         is_full, self._full_curves = self._source.all_curves or self._full_curves > 0, max(0, self._full_curves - 1)
@@ -360,8 +395,6 @@ def extremes(values: Array, bucket: int) -> Times:
 def _columns(entity: str, rows: list[tuple[Times, Any]]) -> Any:
     """Return the columns of an entity in Rerun's form."""
     values = [value for _, value in rows]
-    if entity == SAMPLES:
-        return rr.AnyValues.columns(window=values)  # one column: 'rerun rrd optimize' separates large ones
     if entity in (LOG, EVENTS):
         texts, levels = zip(*values, strict=True)
         return rr.TextLog.columns(text=list(map(visible, texts)), level=list(levels))

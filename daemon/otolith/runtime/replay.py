@@ -25,7 +25,7 @@ from otolith.health.times import moment_text
 from otolith.machine import LoadedMachine, RecordedMachine
 from otolith.machine_file import DriverConfig, driver_configs, signal_units
 from otolith.runtime.segment import Player, first_state
-from otolith.storage.recording_files import MIN_FREE_BYTES, recording_file, shortage_of
+from otolith.storage.recording_files import MIN_FREE_BYTES, recordings_in, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
@@ -116,8 +116,7 @@ def open_span(machine: LoadedMachine, begin: float, end: float) -> Reader:
         ConfigurationError: nothing of that time was kept, or a recording cannot be used.
     """
     names, folder = machine.file.machine, machine.recording_folder
-    known = [recording_file(path) for path in folder.glob("*.rrd")]
-    own = [file for file in known if file is not None and file.key == f"{names.site}.{names.name}"]
+    own = [file for file in recordings_in(folder) if file.key == f"{names.site}.{names.name}"]
     files = [(file.begin, file.path) for file in own if file.begin <= end and file.end >= begin]
     if not files:
         when = partial(moment_text, zone=machine.plan.timezone)

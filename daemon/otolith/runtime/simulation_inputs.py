@@ -15,8 +15,7 @@ from otolith.machine import LoadedMachine
 from otolith.runtime.replay import Replay, open_by_name, open_recorded, open_span
 from otolith.simulation.plan import MAX_RECORDS, follows
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.joined import costs_a_process
-from otolith_drivers.replay.readers import Reader, Rows, holds_frames
+from otolith_drivers.replay.readers import Reader, Rows, holds_frames, is_recording
 from otolith_drivers.replay.span import SpanReader
 
 MAX_LEAD = 5  # windows of a recording, one of which must be usable. docs/reference/thresholds-runtime.md
@@ -86,7 +85,7 @@ def read_inputs(
 
 def _is_recording(machine: LoadedMachine, data: Path) -> bool:
     """Whether a file has the outputs of the twin as well; also if it cannot be read, which its reader says."""
-    if costs_a_process(data) or holds_frames(data) or not data.is_file():
+    if is_recording(data) or holds_frames(data) or not data.is_file():
         return data.is_file() or "=" in str(data)
     try:
         with open_recorded(machine, data):

@@ -1,5 +1,6 @@
 """Recordings of a machine on disk: their names, when a new one begins, and which are deleted for the others.
 
+A recording has a file for viewing (``.rrd``) and its samples beside it, which are counted, marked and deleted with it.
 The names of files sort by time. A file with minutes before or after an event has a mark in its name, and is deleted
 last.
 """
@@ -15,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from otolith_drivers.replay.sample_names import FOLDER, RECORDING, SAMPLES, parts_folder, viewing_file, whole_file
 from otolith_drivers.user_dirs import writable
 
 if TYPE_CHECKING:  # slow to import
@@ -54,9 +56,9 @@ class RecordingBudget:
 
 @dataclass(frozen=True, slots=True)
 class RecordingFile:
-    """A recording on disk."""
+    """A recording on disk, with its samples."""
 
-    path: Path
+    path: Path  # For viewing
     key: str  # Site and machine
     begin: float  # Unix seconds, as is end
     end: float
@@ -65,15 +67,38 @@ class RecordingFile:
 
 
 def recording_file(path: Path) -> RecordingFile | None:
-    """Return what follows from name and status of ``path``; None for another name, and where there is no status."""
+    """Return what follows from name and status of ``path`` and its samples, of which one may be missing.
+
+    None for another name, and where there is no status.
+    """
     if (match := NAME.fullmatch(path.name)) is None:
         return None
     try:
-        status = path.stat()
+        files = _files_of(path)
+        statuses = [each.stat() for each in files]
         begin = datetime.strptime(match["stamp"], STAMP).replace(tzinfo=UTC).timestamp()
-    except (OSError, ValueError):  # deleted meanwhile, a link to itself, a fault of the disk; no date
+        # Samples may be united long after their recording has ended.
+        end = statuses[0].st_mtime if path in files else max(status.st_mtime for status in statuses)
+    except (OSError, ValueError):  # deleted meanwhile, a link to itself, a fault of the disk; no date; no file
         return None
-    return RecordingFile(path, match["key"], begin, status.st_mtime, status.st_size, bool(match["event"]))
+    size = sum(status.st_size for status in statuses)
+    return RecordingFile(path, match["key"], begin, end, size, bool(match["event"]))
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return the files of a recording that are there: for viewing, and with its samples."""
+    return [*(each for each in (path, whole_file(path)) if each.exists()), *parts_folder(path).glob("*")]
+
+
+def size_of(path: Path) -> int:
+    """Return how many bytes a recording takes with its samples; raise OSError if its file for viewing is missing."""
+    return path.stat().st_size + sum(file.stat().st_size for file in _files_of(path) if file != path)
+
+
+def recordings_in(folder: Path) -> list[RecordingFile]:
+    """Return the recordings in a folder, also those of which only the samples are left."""
+    paths = {viewing_file(path) for end in (RECORDING, SAMPLES, FOLDER) for path in folder.glob(f"*{end}")}
+    return [file for path in sorted(paths) if (file := recording_file(path)) is not None]
 
 
 def expendable(
@@ -136,7 +161,7 @@ class RecordingFolder:
             with contextlib.suppress(OSError):  # a folder of another user that this one may write
                 self._folder.chmod(FOLDER_MODE)
         stem = f"{self._key}-{datetime.fromtimestamp(now, UTC).strftime(STAMP)}-{os.getpid()}"
-        taken = {path.name.removesuffix(".rrd").removesuffix(EVENT) for path in self._folder.glob(f"{stem}*.rrd")}
+        taken = {viewing_file(path).stem.removesuffix(EVENT) for path in self._folder.glob(f"{stem}*")}
         count = 1
         while (own := f"{stem}-{count}" if count > 1 else stem) in taken:
             count += 1
@@ -144,8 +169,7 @@ class RecordingFolder:
 
     def files(self) -> list[RecordingFile]:
         """Return the recordings of the machine."""
-        candidates = (recording_file(path) for path in self._folder.glob("*.rrd"))
-        return [file for file in candidates if file is not None and file.key == self._key]
+        return [file for file in recordings_in(self._folder) if file.key == self._key]
 
     def make_room(self, now: float, current: Path | None = None, factor: float = 1.0) -> int:
         """Delete what the budget and the disk demand, but not ``current``; return how many bytes are still missing."""
@@ -154,7 +178,9 @@ class RecordingFolder:
         others = [file for file in files if file.path != current]
         for file in expendable(others, self.budget, now, size, missing):
             with contextlib.suppress(OSError):
-                file.path.unlink()
+                shutil.rmtree(parts_folder(file.path), ignore_errors=True)
+                whole_file(file.path).unlink(missing_ok=True)
+                file.path.unlink(missing_ok=True)
                 log.info("recording deleted for the budget: %s", file.path)
         return shortage_of(self._folder, MIN_FREE_SHARE, factor)
 
@@ -162,9 +188,11 @@ class RecordingFolder:
         """Mark the files with the minutes before ``now``; return the new path of ``current``."""
         for file in self.files():
             if not file.is_marked and (file.path == current or abs(now - file.end) <= EVENT_MARGIN):
-                path = file.path.with_name(f"{file.path.stem}{EVENT}.rrd")
-                with contextlib.suppress(OSError):  # the disk is read-only, or the file gone: it keeps its name
-                    file.path.rename(path)
+                path = file.path.with_name(f"{file.path.stem}{EVENT}{RECORDING}")
+                with contextlib.suppress(OSError):  # the disk is read-only: it keeps its name
+                    for own in (parts_folder, whole_file, viewing_file):
+                        with contextlib.suppress(FileNotFoundError):
+                            own(file.path).rename(own(path))
                     current = path if file.path == current else current
         return current
 

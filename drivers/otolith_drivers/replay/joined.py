@@ -1,5 +1,6 @@
 """Recorded files that follow one another, each a recording of its own, of which one is open at a time."""
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +9,8 @@ from types import TracebackType
 from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import (
-    RECORDING,
     RECORDING_HEAD,
+    DamagedFileError,
     DataFile,
     Mask,
     Reader,
@@ -18,6 +19,7 @@ from otolith_drivers.replay.readers import (
     of_files,
     suffix_of,
 )
+from otolith_drivers.replay.sample_names import RECORDING, sample_files
 
 MAX_LISTED = 16  # files whose rows are counted one by one in a summary
 
@@ -57,21 +59,34 @@ class JoinedReader(Reader):
         self._bad, self._lost = self._begin.bad, self._begin.lost  # In the files before the present one
         self._summaries: list[str] = []  # Of the files that were read
         self._told: list[tuple[Path, str]] = []  # Warnings of the files that were read to their end
-        self._first: Reader | None = open_file(paths[0])
+        self._first: Reader | None = self._open_first()
         first = self._first
         self.place, self.is_table, self.sampling = f"its file's {first.place}", first.is_table, first.sampling
         self._description, ignored = first.describe(), list(first.ignored)
         try:
-            for path in paths[1:] if begin is None else ():
+            for path in self._paths[1:] if begin is None else ():
                 if costs_a_process(path):
                     continue
-                with open_file(path) as reader:
+                with contextlib.suppress(DamagedFileError), open_file(path) as reader:  # told when its turn comes
                     self._check(reader)
                     ignored += reader.ignored
         except BaseException:
             self.__exit__(None, None, None)
             raise
         self.ignored = tuple(dict.fromkeys(ignored))
+
+    def _open_first(self) -> Reader:
+        """Open the first file that is not damaged; raise DamagedFileError if all are."""
+        for path in self._paths:
+            try:
+                reader = self._open_file(path)
+            except DamagedFileError:
+                if path == self._paths[-1]:
+                    raise
+                continue
+            self.path = path
+            return reader
+        raise AssertionError
 
     def _check(self, reader: Reader) -> None:
         if reader.sampling != self.sampling:
@@ -115,23 +130,42 @@ class JoinedReader(Reader):
         A file that was not tried before is opened only here, so its error ends the reading.
         """
         for number, path in enumerate(self._paths, self._begin.files):
-            opened, self._first = self._first or self._open_file(path), None
-            with opened as reader:
-                self._check(reader)
-                self._reader = reader
-                known, is_first = self._taken, number > 0 and not self._taken
-                for rows in reader.chunks():
-                    if len(rows.times) <= known:
-                        known -= len(rows.times)
-                        continue
-                    part, known = rows.part(slice(known, None)), 0
-                    marks: Mask = part.begins.copy()
-                    marks[0] |= is_first
-                    self._begins, is_first = not self._taken, False
-                    self._rows += len(part.times)
-                    self._taken += len(part.times)
-                    yield Rows(part.times, part.columns, part.lines, part.bad + self._bad, marks)
-            self._finish(reader)
+            try:
+                yield from self._rows_of(number, path)
+            except DamagedFileError as error:
+                self._skip(path, error)
+
+    def _rows_of(self, number: int, path: Path) -> Iterator[Rows]:
+        """Yield the rows of a file; raises DamagedFileError only if there are none."""
+        with self._opened(path) as reader:
+            self._check(reader)
+            self._reader = reader
+            known = self._taken
+            is_first = number > 0 and not known and bool(self._rows or self._begin.files)
+            for rows in reader.chunks():
+                if len(rows.times) <= known:
+                    known -= len(rows.times)
+                    continue
+                part, known = rows.part(slice(known, None)), 0
+                marks: Mask = part.begins.copy()
+                marks[0] |= is_first
+                self._begins, is_first = not self._taken, False
+                self._rows += len(part.times)
+                self._taken += len(part.times)
+                yield Rows(part.times, part.columns, part.lines, part.bad + self._bad, marks)
+        self._finish(reader)
+
+    def _opened(self, path: Path) -> Reader:
+        if self._first is not None and path == self.path:
+            opened, self._first = self._first, None
+            return opened
+        return self._open_file(path)
+
+    def _skip(self, path: Path, error: DamagedFileError) -> None:
+        """Leave a damaged file out, and tell it."""
+        self._summaries.append(f"{path.name}: damaged")
+        self._told.append((path, f"left out: {error}"))
+        self._reader, self._read, self._taken = None, self._read + 1, 0
 
     def _finish(self, reader: Reader) -> None:
         """Keep of a file that was read its counts and warnings alone: there may be thousands."""
@@ -165,8 +199,13 @@ def _summary(reader: Reader) -> str:
 
 
 def costs_a_process(path: Path) -> bool:
-    """Whether ``path`` is a recording; raise ConfigurationError if it has only the name of one, or is missing."""
+    """Whether ``path`` is a recording without samples beside it.
+
+    Raises ConfigurationError if it has only the name of one, or is missing.
+    """
     if suffix_of(path) != RECORDING:
+        return False
+    if sample_files(path):
         return False
     DataFile(path).close()  # raises if it cannot be read
     if not head_of(path).startswith(RECORDING_HEAD):

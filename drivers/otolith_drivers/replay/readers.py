@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from otolith_drivers.base import Sampling, Setup, sampling_of
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.replay.sample_names import RECORDING, SAMPLES
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -38,7 +39,7 @@ BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is reco
 # Formats by the end of the file name. The module is imported only when a file asks for it.
 CAN_LOG = "otolith_drivers.replay.can_log"
 READERS = dict.fromkeys((".asc", ".blf", ".db", ".log", ".mf4", ".trc"), CAN_LOG)
-RECORDING, RECORDING_HEAD = ".rrd", b"RRF"
+RECORDING_HEAD = b"RRF"
 READERS[RECORDING] = "otolith_drivers.replay.recording"
 ARRAYS = "otolith_drivers.replay.exports.arrays"  # files that begin so
 ARRAY_HEADS = (b"PAR1", b"ARROW1", b"\x89HDF", b"MATLAB 5.0", b"MATLAB 7.3", b"TDSm")
@@ -138,6 +139,10 @@ def seen(head: bytes) -> str:
     if not other and any(re.match(OTHERS[ANOTHER_TOOL], line.strip()) for line in head.splitlines()[:MAX_LINES]):
         other = ANOTHER_TOOL  # its header may stand below a title
     return other or text_log(head)
+
+
+class DamagedFileError(ConfigurationError):
+    """Nothing of a recording can be read; among several it is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,8 +271,15 @@ def holds_arrays(path: Path) -> bool:
     return _module_of(path) == ARRAYS
 
 
+def is_recording(path: Path) -> bool:
+    """Whether the name is that of a recording of Otolith, or of its samples."""
+    return suffix_of(path) == RECORDING or path.name.lower().endswith(SAMPLES)
+
+
 def _module_of(path: Path) -> str:
     """The module that reads ``path``: by its suffix, and for a text by its first line."""
+    if is_recording(path):
+        return READERS[RECORDING]
     if (module := READERS.get(suffix_of(path))) is not None:
         return module
     head = head_of(path)

@@ -1,14 +1,14 @@
-"""A recording of Otolith (``.rrd``) as rows of numbers: the measured records of its windows.
+"""A recording of Otolith as rows of numbers: the measured records of its windows.
 
-The entity ``samples`` has a row for each window with all its measured records, packed; the curves beside it are for
-the viewer. A missing record is NaN and no reading in the replay. The records of a cyclic source have the times of its
-clock, not those of the arrivals; a window may have been bad because of when its samples came. So the records of bad
-windows are left out. Delays that the machine file declared are added again, because a replay subtracts them.
+The samples are in Parquet files beside the ``.rrd`` file (:mod:`otolith_drivers.replay.sample_files`). Recordings of
+earlier versions have them in the ``.rrd`` file itself: its entity ``samples`` has a row for each window, packed.
 
-Packed, the records of a window are lossless, smaller than numbers of 64 bits, and checked when they are read: the count
-of records and whether the window was good (5 bytes, little endian), then a zlib stream, which has a checksum: the
-differences of the times in ns, then each signal. The bytes of equal weight of all records are next to each other,
-because those of a slow signal repeat.
+A record that is missing is no reading in the replay. The records of a cyclic source have the times of its clock, not
+those of the arrivals; a window may have been bad because of when its samples came. So the records of bad windows are
+left out. Delays that the machine file declared are added again, because a replay subtracts them.
+
+Packed records are the count of records and whether the window was good (5 bytes, little endian), then a zlib stream:
+the differences of the times in ns, then each signal, the bytes of equal weight of all records next to each other.
 """
 
 import contextlib
@@ -18,7 +18,8 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,10 @@ from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay import recording_child
-from otolith_drivers.replay.readers import Array, DataFile, Integers, Reader, Rows
-from otolith_drivers.replay.recording_child import END, FAULT, OPENED, PART, SAMPLES_ENTITY, TIMES, TIMES_ENTITY, WINDOW
+from otolith_drivers.replay.readers import Array, DamagedFileError, DataFile, Integers, Mask, Reader, Rows
+from otolith_drivers.replay.recording_child import END, FAULT, OPENED, PART, TIMES, TIMES_ENTITY, WINDOW
+from otolith_drivers.replay.sample_files import TimesRecord, meaning_of, rows_of
+from otolith_drivers.replay.sample_names import parts_folder, sample_files, viewing_file, whole_file
 from otolith_drivers.units import factor
 
 CHUNK = 50_000  # readings of all signals together; engineering choice, guarded by test_recorder.py
@@ -41,13 +44,6 @@ MAX_RECORDS = 1_000_000  # as many as a window of a machine file may have
 HEADER = struct.Struct("<I?")
 BEING_WRITTEN = "still being written: its last minutes are not in it yet"
 NEVER_CLOSED = "never closed by the recorder: its last records may be missing"
-
-
-def packed(times: Integers, columns: Sequence[Array], *, good: bool) -> bytes:
-    """Return the records of a window; ``times`` (ns) and each column have a value for each record."""
-    words = [np.diff(times, prepend=0), *(np.asarray(column, dtype="<f8").view("<i8") for column in columns)]
-    content = b"".join(_transposed(word.astype("<i8", copy=False)) for word in words)
-    return HEADER.pack(len(times), good) + zlib.compress(content)
 
 
 def unpacked(data: bytes, signals: int) -> tuple[bool, Integers, Array]:
@@ -71,18 +67,6 @@ def unpacked(data: bytes, signals: int) -> tuple[bool, Integers, Array]:
     return good, times, numbers[1:].view("<f8").astype(np.float64).reshape(signals, count)
 
 
-def _transposed(numbers: Integers) -> bytes:
-    return np.ascontiguousarray(numbers).view(np.uint8).reshape(-1, 8).T.tobytes()
-
-
-class TimesRecord(StrictModel):
-    """What the times and the packed records of a recording mean, as the recorder writes it."""
-
-    sampling: Sampling | dict[str, Sampling]  # Of all signals, or by signal
-    delays: dict[str, float]  # By signal, s
-    signals: dict[str, str]  # Unit of each packed signal, in their order
-
-
 class NoOptions(StrictModel):
     """Nothing is stated of a whole recording."""
 
@@ -96,7 +80,19 @@ Source, Options = RecordingSource, NoOptions  # for readers.Format
 
 def open_log(path: Path, setup: Setup, _: object = None) -> "RecordingReader":
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
-    return RecordingReader(path, {signal.name: signal.unit for signal in setup.signals})
+    return open_recording(path, {signal.name: signal.unit for signal in setup.signals})
+
+
+def open_recording(path: Path, units: Mapping[str, str]) -> "RecordingReader":
+    """Open a recording, by its own path or by that of its samples; ``units`` has the unit of each wanted signal.
+
+    Raises:
+        DamagedFileError: none of its samples can be read.
+        ConfigurationError: the file is missing, of another program, or lacks a wanted signal.
+    """
+    if sample_files(path):
+        return SamplesReader(path, units)
+    return PackedReader(path, units)
 
 
 class _Parts:
@@ -129,32 +125,167 @@ class _Parts:
 
 
 class RecordingReader(Reader):
-    """A recording, which a child process reads while it is replayed."""
+    """An open recording."""
 
     place = "record"
     bad = 0
 
-    def __init__(self, path: Path, units: dict[str, str]) -> None:
-        """Read the file as far as its first window; ``units`` has the unit of each wanted signal.
-
-        Raises:
-            ConfigurationError: the file is missing, damaged, of another program, or lacks a wanted signal.
-        """
+    def __init__(self, path: Path, units: Mapping[str, str]) -> None:
+        """``units`` has the unit of each wanted signal."""
         super().__init__(path)
-        self._records = self._windows_bad = 0
+        self._records = self._records_bad = 0
         self._delays: dict[str, int] = {}  # ns; subtracted from the recorded times, so that the readings came later
         self._units = units
-        self._written: dict[str, str] | None = None  # Unit of each recorded signal; None until the file tells them
-        self._closed, self._ended = True, False
+        self._closed = True
+        self._places: dict[str, int] = {}  # Of each recorded signal among the values
+        self._scales: dict[str, tuple[float, float]] = {}
+
+    @abstractmethod
+    def _windows(self) -> Iterator[tuple[Integers, Array, Mask]]:
+        """Yield times in ns, values (signals, records) and which records are of good windows, some at a time."""
+
+    def _note_times(self, written: TimesRecord, *, has_windows: bool) -> None:
+        """Note what the records mean."""
+        self.sampling = written.sampling
+        self._delays = {name: round(1e9 * delay) for name, delay in written.delays.items()}
+        self._places = {name: place for place, name in enumerate(written.signals)}
+        self._scales = {
+            name: self._scale(name, unit, written.signals, has_windows=has_windows)
+            for name, unit in self._units.items()
+        }
+
+    def _scale(self, name: str, unit: str, written: Mapping[str, str], *, has_windows: bool) -> tuple[float, float]:
+        """Scale and offset from the recorded unit of a signal, in ``written``, to ``unit``."""
+        if name in written and not has_windows:
+            when = "its daemon ended before the first one" if self._closed else "some minutes are written at a time"
+            raise ConfigurationError(f"{self.path}: no window is in it: {when}")
+        if name not in written:
+            others = [other for other in written if other not in self._units]
+            known = nearest(name, others) if others else f"it has {', '.join(sorted(written)) or 'none'}"
+            raise ConfigurationError(f"{self.path}: no signal {name!r} ({unit}) was recorded: {known}")
+        try:
+            return factor(written[name], unit)
+        except ValueError as error:
+            raise ConfigurationError(f"{self.path}: signal {name!r}: {error}") from error
+
+    def chunks(self) -> Iterator[Rows]:
+        buffers = {name: _SignalBuffer() for name in self._units}
+        fresh, until = 0, 0
+        for times, values, good in self._windows():
+            if not len(times):
+                continue
+            self._records_bad += int(np.count_nonzero(~good))
+            values[:, ~good] = np.nan
+            for name, buffer in buffers.items():
+                scale, offset = self._scales[name]
+                buffer.add(times + self._delays.get(name, 0), scale * values[self._places[name]] + offset)
+            fresh, until = fresh + values.size, times[-1] + min(self._delays.get(name, 0) for name in buffers)
+            if fresh >= CHUNK:
+                fresh = 0
+                yield from self._rows(buffers, until)
+        yield from self._rows(buffers, MAX_NS)
+        if not self._records:
+            raise DamagedFileError(f"{self.path}: no records can be read")
+
+    def _rows(self, buffers: dict[str, "_SignalBuffer"], until: int) -> Iterator[Rows]:
+        """The rows up to ``until`` (ns), one for each time at which any signal has a reading."""
+        parts = {name: buffer.take(until) for name, buffer in buffers.items()}
+        grid = np.unique(np.concatenate([times for times, _ in parts.values()]))
+        if not len(grid):
+            return
+        columns = {}
+        for name, (times, values) in parts.items():
+            column = np.full(len(grid), np.nan)
+            column[np.searchsorted(grid, times)] = values
+            columns[name] = column
+        first = self._records + 1
+        self._records += len(grid)
+        numbers = np.arange(first, self._records + 1)
+        yield Rows(grid / 1e9, columns, numbers, np.full(len(grid), self.bad, dtype=np.int64))
+
+    def describe(self) -> list[str]:
+        return [f"{name} [{unit}] from the samples" for name, unit in self._units.items()]
+
+    def summary_lines(self) -> list[str]:
+        return [f"{self._records} records read", f"{self.bad} bad"]
+
+    def warnings(self) -> list[str]:
+        lines = [] if self._closed else [BEING_WRITTEN if self._is_being_written() else NEVER_CLOSED]
+        if self._records_bad:
+            lines.append(f"records of windows that were bad when they were recorded, left out: {self._records_bad}")
+        return lines
+
+    def _is_being_written(self) -> bool:
+        path = viewing_file(self.path)
+        return path.exists() and is_being_written(path)
+
+
+class SamplesReader(RecordingReader):
+    """A recording whose samples are in Parquet files, of which one is open at a time; damaged ones are left out."""
+
+    def __init__(self, path: Path, units: Mapping[str, str]) -> None:
+        """Read what the records mean; raises as :func:`open_recording`."""
+        super().__init__(path, units)
+        self._files = sample_files(path)
+        for file in self._files:
+            DataFile(file).close()  # raises if it cannot be read
+        self._closed = self._files == [whole_file(path)]
+        self._damages: dict[Path, str] = {}
+        self._read = 0  # Files that were read
+        meanings, rows = list[TimesRecord](), 0
+        for file in self._files:
+            try:
+                meaning, count = meaning_of(file)
+            except (ValueError, OSError) as error:
+                self._damages[file] = _reason(error)
+                continue
+            meanings, rows = [*meanings[:1], meaning], rows + count
+            if meanings[0] != meaning:
+                raise ConfigurationError(f"{file}: its times have another meaning than those of the files before it")
+        if not meanings:
+            raise DamagedFileError(f"{path}: its samples are damaged: {next(iter(self._damages.values()))}")
+        self._note_times(meanings[0], has_windows=rows > 0)
+
+    @property
+    def progress(self) -> float:
+        """Share of the files that was read, 0 to 1."""
+        return self._read / len(self._files)
+
+    def _windows(self) -> Iterator[tuple[Integers, Array, Mask]]:
+        count = len(self._places)
+        for file in self._files:
+            for part in () if file in self._damages else rows_of(file, count, CHUNK // max(1, count)):
+                if isinstance(part, str):
+                    self._damages[file] = part
+                    self.bad += 1
+                else:
+                    yield part
+            self._read += 1
+
+    def warnings(self) -> list[str]:
+        what = "is damaged, and left out or ends early"
+        return [*super().warnings(), *(f"{file.name} {what}: {why}" for file, why in self._damages.items())]
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of an error of a library."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+class PackedReader(RecordingReader):
+    """A recording of an earlier version, which a child process reads while it is replayed."""
+
+    def __init__(self, path: Path, units: Mapping[str, str]) -> None:
+        """Read the file as far as its first window; raises as :func:`open_recording`."""
+        super().__init__(path, units)
+        self._written: TimesRecord | None = None  # None until the file tells it
+        self._ended = False
         DataFile(path).close()  # raises if it cannot be read
-        self._is_being_written = is_being_written(path)
         self._child = _Parts(path)
         self._parts = iter(self._child)
         try:
             self._waiting = self._read_first_windows()
-            written: dict[str, str] = self._written or {}
-            self._places = {name: place for place, name in enumerate(written)}
-            self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
+            self._note_times(self._stated(), has_windows=bool(self._waiting))
         except BaseException:
             self._child.close()
             raise
@@ -166,6 +297,12 @@ class RecordingReader(Reader):
     def progress(self) -> float:
         """Share of the file that was read, 0 to 1."""
         return 1.0 if self._ended else self._child.progress
+
+    def _stated(self) -> TimesRecord:
+        if self._written is None:
+            own = f"{whole_file(self.path).name}, or in the folder {parts_folder(self.path).name}"
+            raise ConfigurationError(f"{self.path}: has no samples: they are in {own}: put them beside it")
+        return self._written
 
     def _read_first_windows(self) -> list[bytes]:
         """Read what the records mean, and return the windows up to there, one at least unless the file has none."""
@@ -182,7 +319,7 @@ class RecordingReader(Reader):
         if letter == OPENED:
             self._note_opened(json.loads(content))
         elif letter == TIMES:
-            self._note_times(content.decode())
+            self._written = self._meaning(content.decode())
         elif letter == END:
             self._ended = True
         else:
@@ -202,50 +339,17 @@ class RecordingReader(Reader):
             raise ConfigurationError(f"{self.path}: of application {applications[0]!r}: one of Otolith is needed")
         self._closed = opened["is_closed"]
 
-    def _note_times(self, text: str) -> None:
-        """Note what the records mean."""
+    def _meaning(self, text: str) -> TimesRecord:
         try:
-            written = TimesRecord.model_validate_json(text)
+            return TimesRecord.model_validate_json(text)
         except ValueError as error:
             known = ", ".join(Sampling)
             remedy = f"it needs sampling ({known}), delays and signals: was it written by another version of Otolith?"
             raise ConfigurationError(
                 f"{self.path}: {TIMES_ENTITY} does not state what the times mean: {remedy}"
             ) from error
-        self.sampling, self._written = written.sampling, written.signals
-        self._delays = {name: round(1e9 * delay) for name, delay in written.delays.items()}
 
-    def _scale(self, name: str, unit: str, written: Mapping[str, str]) -> tuple[float, float]:
-        """Scale and offset from the recorded unit of a signal, in ``written``, to ``unit``."""
-        if name in written and not self._waiting:
-            when = "its daemon ended before the first one" if self._closed else "some minutes are written at a time"
-            raise ConfigurationError(f"{self.path}: no window is in it: {when}")
-        if name not in written:
-            others = [other for other in written if other not in self._units]
-            known = nearest(name, others) if others else f"it has {', '.join(sorted(written)) or 'none'}"
-            raise ConfigurationError(f"{self.path}: no signal {name!r} ({unit}) was recorded: {known}")
-        try:
-            return factor(written[name], unit)
-        except ValueError as error:
-            raise ConfigurationError(f"{self.path}: signal {name!r}: {error}") from error
-
-    def chunks(self) -> Iterator[Rows]:
-        buffers = {name: _SignalBuffer() for name in self._units}
-        fresh, until = 0, 0
-        for times, values in self._read_windows():
-            for name, buffer in buffers.items():
-                scale, offset = self._scales[name]
-                buffer.add(times + self._delays.get(name, 0), scale * values[self._places[name]] + offset)
-            fresh, until = fresh + values.size, times[-1] + min(self._delays.get(name, 0) for name in buffers)
-            if fresh >= CHUNK:
-                fresh = 0
-                yield from self._rows(buffers, until)
-        yield from self._rows(buffers, MAX_NS)
-        if not self._records:
-            raise ConfigurationError(f"{self.path}: no records")
-
-    def _read_windows(self) -> Iterator[tuple[Integers, Array]]:
-        """Yield times in ns and values (signals, records) of each window; a bad window has no readings."""
+    def _windows(self) -> Iterator[tuple[Integers, Array, Mask]]:
         windows = self._waiting
         while windows or not self._ended:
             for data in windows:
@@ -254,40 +358,8 @@ class RecordingReader(Reader):
                 except ValueError:
                     self.bad += 1
                     continue
-                if not good:
-                    self._windows_bad += 1
-                    values[:] = np.nan
-                if len(times):
-                    yield times, values
+                yield times, values, np.full(len(times), good)
             windows = [] if self._ended else self._next_window()
-
-    def _rows(self, buffers: dict[str, "_SignalBuffer"], until: int) -> Iterator[Rows]:
-        """The rows up to ``until`` (ns), one for each time at which any signal has a reading."""
-        parts = {name: buffer.take(until) for name, buffer in buffers.items()}
-        grid = np.unique(np.concatenate([times for times, _ in parts.values()]))
-        if not len(grid):
-            return
-        columns = {}
-        for name, (times, values) in parts.items():
-            column = np.full(len(grid), np.nan)
-            column[np.searchsorted(grid, times)] = values
-            columns[name] = column
-        first = self._records + 1
-        self._records += len(grid)
-        numbers = np.arange(first, self._records + 1)
-        yield Rows(grid / 1e9, columns, numbers, np.full(len(grid), self.bad, dtype=np.int64))
-
-    def describe(self) -> list[str]:
-        return [f"{name} [{unit}] from {SAMPLES_ENTITY}" for name, unit in self._units.items()]
-
-    def summary_lines(self) -> list[str]:
-        return [f"{self._records} records read", f"{self.bad} bad"]
-
-    def warnings(self) -> list[str]:
-        lines = [] if self._closed else [BEING_WRITTEN if self._is_being_written else NEVER_CLOSED]
-        if self._windows_bad:
-            lines.append(f"windows that were bad when they were recorded, left out: {self._windows_bad}")
-        return lines
 
 
 def is_being_written(path: Path) -> bool:

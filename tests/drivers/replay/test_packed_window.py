@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.replay.recording import HEADER, MAX_RECORDS, packed, unpacked
+from otolith_drivers.replay.recording import HEADER, MAX_RECORDS, unpacked
+from tests.drivers.replay.packed_windows import packed
 from tests.messages import assert_refuses
 
 WORDS = st.integers(-(2**63), 2**63 - 1)

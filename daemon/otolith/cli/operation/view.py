@@ -23,6 +23,7 @@ from otolith.cli.operation.history import Since, age_or_date
 from otolith.cli.terminal import echo
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
 from otolith_drivers.errors import ConfigurationError, ServiceError, some_names
+from otolith_drivers.replay.sample_names import SAMPLES, viewing_file
 from otolith_drivers.user_dirs import cache_directory, state_directory
 
 MAGIC = b"RRF2"  # first bytes of Rerun's files
@@ -63,6 +64,8 @@ def view(recordings: tuple[str, ...], since: Since | None, only_list: bool, live
             raise click.UsageError("several are opened only if all are files (.rrd), without other choices")
         return open_viewer([Path(name) for name in recordings], web=web)
     recording = recordings[0] if recordings else None
+    if recording and recording.endswith(SAMPLES):
+        recording = str(viewing_file(Path(recording)))
     path = Path(recording) if recording and is_file(recording) and not recording.endswith(".toml") else None
     path = Path(recording) if recording and recording.endswith(".rrd") else path
     if path is not None:
