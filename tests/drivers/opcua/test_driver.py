@@ -7,7 +7,7 @@ import signal
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from cryptography import x509
 from otolith.cli.main import cli
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.common import reconnection
+from otolith_drivers.common.sharing import places
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.opcua import driver as opcua
 from otolith_drivers.opcua.connection import certificate_warnings, lasting_name, place
@@ -83,6 +84,23 @@ def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
     first = samples[before].time
     assert counters.reconnects == 2
     assert counters.lost >= 0.9 * 2 * (first - gone) / period
+
+
+def test_a_server_that_is_restarted_is_one_reconnection_of_each_machine_that_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconnection, "BACKOFF_MAX", 0.3)
+    port = free_port(socket.SOCK_STREAM)
+    with ExitStack() as stack:
+        with opcua_server(port, VALUES):
+            machines = [stack.enter_context(opened(port, tmp_path, nodes={"i": "ns=2;s=i"})) for _ in range(2)]
+            wait_for(lambda: all(samples for _, samples in machines))
+        wait_for(lambda: all(driver.link().reason == "Connection refused" for driver, _ in machines))
+        with opcua_server(port, VALUES):
+            wait_for(lambda: all(driver.link().up for driver, _ in machines))
+            assert [driver.counters().reconnects for driver, _ in machines] == [1, 1]
+            assert len(places()) == 1
+    assert not places()
 
 
 def test_stamps_of_a_clock_an_hour_ahead_are_refused_and_those_of_the_server_used(port: int, tmp_path: Path) -> None:
