@@ -190,3 +190,27 @@ def test_whoever_comes_while_a_connection_is_being_closed_gets_a_new_one(monkeyp
     assert Line.opened == count + 2
     second.close()
     assert not places()
+
+
+def test_nobody_joins_a_connection_that_its_last_user_breaks_off() -> None:
+    """What comes after that gets a connection of its own, which nobody has broken off."""
+    first, second, count = OtherDriver(), OtherDriver(), Line.opened
+    first.open(lambda _: None)
+    assert first._line is not None
+    assert first._delivery is not None
+    assert first._line.is_last_use_of(first._delivery)
+    joining = threading.Thread(target=second.open, args=(lambda _: None,))
+    joining.start()
+    assert Line.opened == count + 1
+    first.close()
+    joining.join(PATIENCE)
+    assert second._line is not None
+    assert second._line is not first._line
+    assert second._delivery is not None
+    third = OtherDriver()
+    third.open(lambda _: None)
+    assert third._line is second._line
+    assert not second._line.is_last_use_of(second._delivery)
+    for driver in (second, third):
+        driver.close()
+    assert not places()
