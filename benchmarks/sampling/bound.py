@@ -58,14 +58,14 @@ def efficient_estimate(recording: Recording, start: float, end: float, free: Seq
     columns += [outputs(recording.motor, state + unit, recording.inputs) - truth for unit in np.eye(2)]
     jacobian = np.column_stack(columns)
     sensors = np.concatenate([np.full(len(own), NOISE[name]) for name, own in zip(OUTPUTS, times, strict=True)])
-    load_covariance, load_error = _load(recording, times, start, end)
+    unknown, load_error = _load(recording, times, start, end)
     unexpected = np.concatenate(values) - truth + load_error
-    covariance: Array = np.diag(sensors**2) + load_covariance
     for possible in _possible_inputs(recording, start, end):
         effects = np.array([outputs(recording.motor, state, inputs) for inputs in possible]) - truth
         unexpected -= effects.mean(axis=0)
-        covariance = covariance + np.cov(effects, rowvar=False, bias=True)
-    weighted = cho_solve(cho_factor(covariance), jacobian)
+        covariance = np.cov(effects, rowvar=False, bias=True)
+        unknown = covariance if unknown is None else unknown + covariance
+    weighted = _weighted(jacobian, sensors, unknown)
     fisher = jacobian.T @ weighted
     scale = np.sqrt(np.diag(fisher))
     if not (scale > 0.0).all() or np.linalg.cond(fisher / np.outer(scale, scale)) > 1e12:
@@ -76,6 +76,13 @@ def efficient_estimate(recording: Recording, start: float, end: float, free: Seq
     return EfficientEstimate(np.sqrt(np.diag(inverse))[: len(free)] * nominal, error[: len(free)] * nominal)
 
 
+def _weighted(jacobian: Array, sensors: Array, unknown: Array | None) -> Array:
+    """Return the inverse of the covariance times the derivatives; ``unknown`` is what inputs add to that of sensors."""
+    if unknown is None:
+        return np.asarray(jacobian / sensors[:, None] ** 2)
+    return np.asarray(cho_solve(cho_factor(np.diag(sensors**2) + unknown), jacobian))
+
+
 def _samples_of(recording: Recording, start: float, end: float) -> tuple[list[Array], list[Array]]:
     """Return true times and values of the fresh samples of each output whose stated times are in [start, end)."""
     samples = [recording.samples[name] for name in OUTPUTS]
@@ -84,11 +91,13 @@ def _samples_of(recording: Recording, start: float, end: float) -> tuple[list[Ar
     return [own.times[part] for own, part in pairs], [own.values[part] for own, part in pairs]
 
 
-def _load(recording: Recording, times: Sequence[Array], start: float, end: float) -> tuple[Array, Array]:
-    """Return covariance and true value of what the load torque adds to the outputs beyond what its samples show."""
+def _load(recording: Recording, times: Sequence[Array], start: float, end: float) -> tuple[Array | None, Array]:
+    """Return covariance and true value of what the load torque adds to the outputs beyond what its samples show.
+
+    The covariance is None where they show all of it.
+    """
     if not recording.load_noise and not recording.walk:
-        count = sum(map(len, times))
-        return np.zeros((count, count)), np.zeros(count)
+        return None, np.zeros(sum(map(len, times)))
     knots, loads = recording.inputs.load_times, recording.inputs.loads
     near = (knots >= start - 0.1) & (knots <= end + 0.1)
     effect = load_effect(recording.motor, knots[near], times, start)
