@@ -39,7 +39,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def in_processes(jobs: Sequence[Callable[[], Result]], processes: int) -> list[Result]:
-    """Return the results of the jobs, in their order; progress goes to the standard error."""
+    """Return the results of the jobs, in their order; progress goes to the standard error. One process is this one."""
+    if processes == 1:
+        results = []
+        for job in jobs:
+            results.append(job())
+            show_progress(len(results), len(jobs), "parts")
+        return results
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         pending = [pool.submit(job) for job in jobs]
         for count, _ in enumerate(as_completed(pending), 1):

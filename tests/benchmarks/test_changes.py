@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.changes import classes, healthy, steps
+from benchmarks.changes.__main__ import main
 from benchmarks.changes.classes import Trial
 from benchmarks.changes.machines import (
     DC_MOTOR,
@@ -25,6 +26,7 @@ from benchmarks.changes.machines import (
 )
 from benchmarks.changes.observe import Case, observe
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Term, generator, simulate
+from click.testing import CliRunner
 
 from otolith.acquisition.window import Array
 from otolith.estimation.problem import Component, Problem, augment
@@ -131,16 +133,23 @@ def test_runs_that_are_simulated_together_are_those_simulated_alone() -> None:
     assert together[1] == alone[0]
 
 
-def printed(*arguments: str) -> str:
-    command = [sys.executable, "-m", "benchmarks.changes", *arguments, "--processes", "1"]
-    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=3600, check=False)
-    assert process.returncode in (0, 1), process.stderr
-    assert re.fullmatch(r"(\d+ of \d+ parts\n)+", process.stderr), process.stderr
-    return process.stdout
+def checked(code: int, output: str, errors: str) -> str:
+    """The output of a command that ends as it should."""
+    assert code in (0, 1), errors
+    assert re.fullmatch(r"(\d+ of \d+ parts\n)+", errors), errors
+    return output
+
+
+def printed_by_a_process(*arguments: str) -> str:
+    command = [sys.executable, "-m", "benchmarks.changes", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=3600, check=False)
+    return checked(done.returncode, done.stdout, done.stderr)
 
 
 def run(*arguments: str) -> Any:
-    return json.loads(printed(*arguments, "--json"))
+    """What a command prints in this process, which has loaded the kernels."""
+    done = CliRunner().invoke(main, [*arguments, "--processes", "1", "--json"], catch_exceptions=False)
+    return json.loads(checked(done.exit_code, done.stdout, done.stderr))
 
 
 def test_classes_prints_what_the_reports_state() -> None:
@@ -171,7 +180,7 @@ def test_calibration_prints_a_table() -> None:
 def test_reports_are_the_same_in_every_run(tmp_path: Path) -> None:
     before = tmp_path / "before.json"
     before.write_text(json.dumps(run("reports", "step of R_a")))
-    assert "the same" in printed("reports", "step of R_a", "--against", str(before))
+    assert "the same" in printed_by_a_process("reports", "step of R_a", "--against", str(before), "--processes", "2")
 
 
 def test_interchangeable_changes_are_stated_as_classes() -> None:
