@@ -16,6 +16,9 @@ from otolith.health.prognosis import (
     REFIT,
     History,
     Trend,
+    _cells,
+    _Data,
+    _Shapes,
     errors_of_means,
     find_trend,
     forecast,
@@ -138,6 +141,27 @@ def test_correlated_errors_are_no_trend(rho: float) -> None:
             result = forecast(QUANTITY, history_of(values[:count]))
             assert result.act is None
             assert result.reason
+
+
+@pytest.mark.parametrize("seed", often([1], [1, 2, 3]))
+def test_a_model_of_a_history_is_the_regression_with_correlated_errors(seed: int) -> None:
+    """Against the same regression with the whole covariance matrix of the errors, at each time constant."""
+    random, change = np.random.default_rng(seed), 0.8
+    history = history_of((NOMINAL + SD * correlated(60, 0.7, random) + np.linspace(0.0, 0.4, 60)).tolist())
+    data, shapes = _Data.of(history, change), _Shapes(np.array([10.0, 60.0]), np.array([0.0, 3.0]), np.full(2, np.inf))
+    cells = _cells(data, shapes)
+    mean, covariance = cells.mean.reshape(-1, 2, 2), cells.covariance.reshape(-1, 2, 2, 2)
+    for constant, (deviations, rho) in enumerate(zip(data.deviations, data.correlation, strict=True)):
+        lag = np.concatenate([[0.0], np.cumsum(np.log(rho))])
+        errors = np.exp(-np.abs(lag[:, None] - lag[None, :])) * np.outer(deviations, deviations)
+        for cell, curve in enumerate(shapes.at(data.times, data.times[-1])):
+            rows = np.stack([np.ones_like(curve), curve])
+            precision = rows @ np.linalg.solve(errors, rows.T) + np.diag([(100.0 * change) ** -2.0, change**-2.0])
+            expected = np.linalg.solve(precision, rows @ np.linalg.solve(errors, data.values))
+            sd = np.sqrt(np.diag(np.linalg.inv(precision)))
+            assert mean[constant, cell] - [data.origin, 0.0] == pytest.approx(expected, abs=1e-6 * sd.min())
+            ratio = covariance[constant, cell] / np.linalg.inv(precision)  # the unknown factor on all variances
+            assert ratio == pytest.approx(np.full((2, 2), ratio[0, 0]), rel=1e-6)
 
 
 def test_few_estimates_give_no_forecast() -> None:

@@ -160,7 +160,8 @@ class Trend:
         covariance = cells.covariance
         variance = covariance[:, 0, 0] + 2.0 * shape * covariance[:, 0, 1] + shape**2 * covariance[:, 1, 1]
         excess = (limit - mean if is_lower else mean - limit) / np.sqrt(variance)
-        return float(sum(w * 0.5 * math.erfc(-z / math.sqrt(2.0)) for w, z in zip(weight, excess, strict=True)))
+        tails = map(math.erfc, (excess / -math.sqrt(2.0)).tolist())  # SciPy's is not for the daemon, which imports this
+        return 0.5 * float(weight @ np.fromiter(tails, np.float64, len(excess)))
 
 
 def with_point(history: History, time: float, value: float, variance: float) -> History:
@@ -240,12 +241,28 @@ class _Data:
         """Return the times at a share of the points but the last ones ``after`` them."""
         return np.interp(share * (len(self.times) - 1.0 - after), np.arange(len(self.times)), self.times)
 
-    def whitened(self, rows: Array) -> Array:
-        """Return (rows, points) for each time constant: (time constants, rows, points) with independent errors."""
-        scaled = rows / self.deviations[:, None, :]
-        rho = self.correlation[:, None, :]
-        later = (scaled[:, :, 1:] - rho * scaled[:, :, :-1]) / np.sqrt(self.innovation[:, None, :])
-        return np.concatenate([scaled[:, :, :1], later], axis=2)
+    def whitened(self, row: Array) -> Array:
+        """Return a row (points,) for each time constant: (time constants, points) with independent errors."""
+        scaled = row / self.deviations
+        later = (scaled[:, 1:] - self.correlation * scaled[:, :-1]) / np.sqrt(self.innovation)
+        return np.concatenate([scaled[:, :1], later], axis=1)
+
+    def products(self, curves: Array, rows: Array) -> tuple[Array, Array]:
+        """Return the sums over the points of whitened curves with rows that are white, and of their squares.
+
+        ``curves`` are (curves, points), ``rows`` (rows, time constants, points), the sums (rows, time constants,
+        curves) and (time constants, curves). A white curve is a sum of the steps of the curve and of its values, each
+        times what is the same for all curves: so it is not made, and products of matrices have the sums. None of them
+        is a difference of large numbers.
+        """
+        first, spread = self.deviations[:, :1], np.sqrt(self.innovation)
+        of_step = 1.0 / (self.deviations[:, 1:] * spread)
+        of_value = of_step - self.correlation / (self.deviations[:, :-1] * spread)
+        steps, values, begin = np.diff(curves), curves[:, :-1], curves[:, :1]
+        with_rows = rows[:, :, :1] / first * begin[:, 0]
+        with_rows += (of_step * rows[:, :, 1:]) @ steps.T + (of_value * rows[:, :, 1:]) @ values.T
+        squares = (begin[:, 0] / first) ** 2 + of_step**2 @ (steps**2).T + of_value**2 @ (values**2).T
+        return with_rows, squares + 2.0 * (of_step * of_value) @ (steps * values).T
 
 
 def errors_of_means(gaps: Array, rho: Array) -> tuple[Array, Array]:
@@ -281,28 +298,29 @@ def _cells(data: _Data, changes: _Shapes, *, is_constant: bool = False) -> _Cell
     """
     curves = changes.at(data.times, data.times[-1])
     count, points = curves.shape
-    rows = data.whitened(np.concatenate([np.ones((1, points)), data.values[None, :], curves]))
-    ones, values, curves = rows[:, :1], rows[:, 1:2], rows[:, 2:]
-    prior = np.diag([(UNKNOWN_CONSTANT * data.change) ** -2.0, data.change**-2.0])
-    if is_constant:
-        curves = np.zeros_like(curves)
-    precision = np.empty((len(rows), count, 2, 2))
-    precision[..., 0, 0] = (ones * ones).sum(2)
-    precision[..., 0, 1] = precision[..., 1, 0] = (ones * curves).sum(2)
-    precision[..., 1, 1] = (curves * curves).sum(2)
-    precision += prior
-    moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (curves * values).sum(2)], axis=2)
-    covariance = np.linalg.inv(precision)
-    mean = np.einsum("tcij,tcj->tci", covariance, moment)
-    residual = (values * values).sum(2) - (mean * moment).sum(2)
+    rows = np.stack([data.whitened(np.ones(points)), data.whitened(data.values)])
+    (of_ones, with_value), (_, of_values) = (rows[:, None] * rows[None]).sum(3)
+    (with_ones, with_values), squares = data.products(np.zeros_like(curves) if is_constant else curves, rows)
+    # The precision of constant and change is a matrix of two rows: it is inverted by hand, for each cell.
+    of_prior = (UNKNOWN_CONSTANT * data.change) ** -2.0, data.change**-2.0
+    of_constant = np.broadcast_to(of_ones[:, None] + of_prior[0], squares.shape)
+    left = with_ones / of_constant
+    of_change = squares + of_prior[1] - left * with_ones  # once the constant is known
+    moment = np.stack([np.broadcast_to(with_value[:, None], squares.shape), with_values], axis=2)
+    change = (moment[..., 1] - left * moment[..., 0]) / of_change
+    mean = np.stack([moment[..., 0] / of_constant - left * change, change], axis=2)
+    crossed = -left / of_change
+    covariance = np.stack([1.0 / of_constant - left * crossed, crossed, crossed, 1.0 / of_change], axis=2)
+    covariance = covariance.reshape(*squares.shape, 2, 2)
+    residual = of_values[:, None] - (mean * moment).sum(2)
     # The factor on the variances has an inverse gamma posterior of this scale and order.
     scale, order = FACTOR_SHAPE + 0.5 * np.maximum(residual, 0.0), FACTOR_SHAPE + 0.5 * points
-    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - order * np.log(scale)
+    log_weight = 0.5 * (math.log(of_prior[0] * of_prior[1]) - np.log(of_constant * of_change)) - order * np.log(scale)
     log_weight -= (0.5 * np.log(data.innovation).sum(1) + np.log(data.deviations).sum(1))[:, None]
     log_weight -= math.log(log_weight.size)
     covariance = covariance * (scale / (order - 1.0))[..., None, None]
     mean[..., 0] += data.origin
-    shapes = changes.rows(np.tile(np.arange(count), len(rows)))
+    shapes = changes.rows(np.tile(np.arange(count), len(squares)))
     return _Cells(log_weight.ravel(), shapes, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))
 
 
