@@ -181,11 +181,14 @@ class Tables:
             self._connection.executemany("INSERT INTO label VALUES (?, ?)", labels.spans)
             self._labels = labels
 
-    def add(self, document: ReportDocument) -> None:
-        """Write a report with service times, and the events that it changed; :meth:`merge` writes the rest."""
+    def add(self, document: ReportDocument, text: str = "") -> None:
+        """Write a report with service times, and the events that it changed; :meth:`merge` writes the rest.
+
+        ``text`` is the JSON of the report, if it was made already.
+        """
         execute, end = self._connection.execute, document.window.end
-        text = zlib.compress(document.to_json().encode(), COMPRESSION)
-        execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, text))
+        packed = zlib.compress((text or document.to_json()).encode(), COMPRESSION)
+        execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, packed))
         for event in document.events:
             if event.change is not None:
                 row = (event.sequence, end, event.json_line())

@@ -12,15 +12,18 @@ import sqlite3
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from otolith.health.labels import Numbers, TimeLabels
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
-from otolith.storage.disk import WriterThread, give_to, opened_folder
+from otolith.storage.disk import WriterThread, give_to, opened_folder, phase_of
 from otolith.storage.history import (
     BUSY_TIMEOUT,
     CHECKPOINT_BYTES,
@@ -189,8 +192,10 @@ class HistoryWriter(WriterThread):
         self.reader = HistoryReader(path)
         self._path, self._bounds = path, bounds
         self._connection: sqlite3.Connection | None = None
-        self._waiting: deque[ReportDocument] = deque()
-        self._unmerged: list[ReportDocument] = []  # Reports that are written, without their values
+        self._waiting: deque[tuple[ReportDocument, str]] = deque()  # With its JSON
+        # Reports that are written, without their values, by their numbers: as JSON, which takes a tenth of the memory
+        self._unmerged: dict[int | None, str] = {}
+        self._is_urgent = False  # Whether one of them has changed an event
         self._merged_at = 0.0
         self._lock, self._written = threading.Lock(), threading.Event()
         self._pruned_at, self._read_error = 0.0, ""
@@ -214,16 +219,22 @@ class HistoryWriter(WriterThread):
 
     def start(self) -> None:
         """Start the thread that writes."""
-        self._pruned_at = self._merged_at = time.monotonic()
+        phase = 0.0 if self._shared is None else phase_of(self._path.name)
+        self._merged_at, self._pruned_at = (
+            time.monotonic() - phase * interval for interval in (MERGE_INTERVAL, PRUNE_INTERVAL)
+        )
         super().start()
 
-    def add(self, document: ReportDocument) -> None:
-        """Request that a report is written; if too many wait, the oldest is dropped."""
+    def add(self, document: ReportDocument, text: str = "") -> None:
+        """Request that a report is written; if too many wait, the oldest is dropped.
+
+        ``text`` is its JSON, if it was made already.
+        """
         with self._lock:
             if len(self._waiting) >= MAX_WAITING:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._waiting.append(document)
+            self._waiting.append((document, text or document.to_json()))
             if not self._last_error:
                 self._written.clear()
         self.wake()
@@ -296,7 +307,7 @@ class HistoryWriter(WriterThread):
     def _write_waiting(self, now: float = math.inf) -> None:
         """Write what is waiting, and the values of what is written if they are due at ``now`` (monotonic, s)."""
         self._write_reports()
-        is_urgent = self._stopping.is_set() or any(event.change for report in self._unmerged for event in report.events)
+        is_urgent = self._is_urgent or self._stopping.is_set()
         is_due = len(self._unmerged) >= BATCH or now - self._merged_at >= MERGE_INTERVAL
         if self._unmerged and (is_urgent or is_due):
             self._merge()
@@ -306,11 +317,19 @@ class HistoryWriter(WriterThread):
         assert self._connection is not None  # noqa: S101 - for mypy
         try:
             with self._connection:
-                self._tables.merge(self._unmerged)
+                self._tables.merge(self._written_reports())
         except BaseException:
             self._tables.forget_series()
             raise
-        self._unmerged = []
+        self._unmerged, self._is_urgent = {}, False
+        # Else the pages that were written stay in memory, of each machine of a hall up to 2 MB.
+        self._connection.execute("PRAGMA shrink_memory").fetchall()
+
+    def _written_reports(self) -> Iterator[ReportDocument]:
+        """Yield the reports whose values are not written yet; without those that no reader would accept."""
+        for text in self._unmerged.values():
+            with contextlib.suppress(ValidationError):
+                yield ReportDocument.from_json(text)
 
     def _write_reports(self) -> None:
         assert self._connection is not None  # noqa: S101 - for mypy
@@ -324,14 +343,15 @@ class HistoryWriter(WriterThread):
                 with self._connection:
                     self._tables.describe(self.description)
                     self._tables.label(self.labels)
-                    for document in batch:
-                        self._tables.add(document)
+                    for document, text in batch:
+                        self._tables.add(document, text)
             except BaseException:
                 self._tables.forget_series()
                 raise
-            self._unmerged += batch
+            self._unmerged |= {document.sequence: text for document, text in batch}
+            self._is_urgent |= any(event.change for document, _ in batch for event in document.events)
             with self._lock:
-                written = {id(document) for document in batch}
+                written = set(map(id, batch))
                 while self._waiting and id(self._waiting[0]) in written:
                     self._waiting.popleft()
 
@@ -412,9 +432,8 @@ class HistoryWriter(WriterThread):
         connection.execute("PRAGMA journal_size_limit = 0").fetchall()
         self._tables, self._retention = Tables(connection, int(time.time())), Retention(connection, self._bounds)
         reports, run = self._tables.unmerged()
-        known = {report.sequence for report in self._unmerged}
         with connection:
-            Tables(connection, run).merge(report for report in reports if report.sequence not in known)
+            Tables(connection, run).merge(report for report in reports if report.sequence not in self._unmerged)
             self._tables.begin()
 
     def _begin_numbers(self, now: float) -> Numbers:
