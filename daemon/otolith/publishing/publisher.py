@@ -190,9 +190,12 @@ class Publisher:
             with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
                 declared.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
-    def publish(self, document: ReportDocument) -> None:
-        """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
-        text = document.to_json()
+    def publish(self, document: ReportDocument, text: str = "") -> None:
+        """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks.
+
+        ``text`` is the JSON of the report, if it was made already.
+        """
+        text = text or document.to_json()
         others: list[tuple[str, DocumentModel]] = [
             (PARAMETER.under(document.site, document.machine, name), item) for name, item in document.parameters.items()
         ]

@@ -42,7 +42,7 @@ from otolith.runtime.hall.pool import Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
 from otolith.runtime.process import EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.storage.disk import StorageThread, WriterThread
+from otolith.storage.disk import StorageThread, WriterThread, phase_of
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import history_of
@@ -437,7 +437,7 @@ class Service:
 
     def finish(self, finished: FinishedWindow, restarts: int) -> str:
         """Save, keep and publish a window; return its line. ``restarts`` is how often workers were started again."""
-        self._evidence.add(finished.before, finished.window, finished.report, finished.after)
+        self._evidence.add(finished.before, finished.window, finished.report, finished.after, finished.text)
         line = self._publish(finished.report, finished.seconds, restarts)
         self._save(time.monotonic())
         return line
@@ -484,14 +484,16 @@ class Service:
         update["daemon"] = DaemonDocument(version=__version__, certificate=certificate)
         update["notes"] = (*self._notes, *filter(None, [self._refused, warning]))
         document = self.machine.numbers.number(document.model_copy(update=update))
+        text = document.to_json()
         if self._history is not None:
             self._describe()
             self._history.labels = self._clock.labels
-            self._history.add(document)
-        document = self._clock.labels.of_report(document)
+            self._history.add(document, text)
+        labelled = self._clock.labels.of_report(document)
+        document, text = labelled, text if labelled is document else labelled.to_json()
         if self.publisher is not None:
-            self.publisher.publish(document)
-        self._outlets.offer(document)
+            self.publisher.publish(document, text)
+        self._outlets.offer(document, text)
         if self._recorder.is_enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
         return self._log(document, time.monotonic())
@@ -564,4 +566,6 @@ class Service:
         keys = self._unsaved.keys
         if keys != self._saved or now - self._saved_at >= SAVE_INTERVAL:
             self._writer.save(self._unsaved)
-            self._saved, self._saved_at, self._unsaved = keys, now, None
+            is_first, self._saved, self._saved_at, self._unsaved = math.isinf(self._saved_at), keys, now, None
+            if is_first and self._shared is not None:
+                self._saved_at -= phase_of(self.title) * SAVE_INTERVAL

@@ -75,7 +75,10 @@ def answer(packed: PackedState, task: Task) -> WorkerResult:
     performed = _performed(packed.unpack(), task)
     after = packed if performed.report is None else PackedState.of(performed.state, packed)
     after = after.without_plan() if after.plan is packed.plan else after
-    return WorkerResult(task.index, performed.window, after, performed.report, performed.seconds, performed.failure)
+    text = "" if performed.report is None else performed.report.document.to_json()  # the daemon has less time for it
+    return WorkerResult(
+        task.index, performed.window, after, performed.report, performed.seconds, performed.failure, text
+    )
 
 
 def _performed(state: AdaptationState, task: Task) -> Performed:

@@ -245,15 +245,18 @@ class EvidenceWriter(WriterThread):
         self._after: PackedState | None = None
         self._waiting: deque[_Wanted] = deque()
 
-    def add(self, before: PackedState, window: Window, report: Report, after: PackedState) -> None:
-        """Keep the last finished windows with reports and states; request a bundle if this one changed an event."""
+    def add(self, before: PackedState, window: Window, report: Report, after: PackedState, text: str = "") -> None:
+        """Keep the last finished windows with reports and states; request a bundle if this one changed an event.
+
+        ``text`` is the JSON of the report, if it was made already.
+        """
         if not self.max_bytes:
             return
         size = sum(_bytes(item.window) for item in self._newer)
         if not self._states or len(self._newer) >= MIN_WINDOWS or size >= MAX_WINDOW_BYTES:
             self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
         state = None if before is self._after else before
-        self._newer, self._after = (*self._newer, _KeptWindow(state, window, report.document.to_json())), after
+        self._newer, self._after = (*self._newer, _KeptWindow(state, window, text or report.document.to_json())), after
         if events := tuple(filter(has_evidence, announcements(report.document))):
             is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
             self.dropped += is_full

@@ -59,6 +59,7 @@ class WorkerResult:
     report: Report | None
     seconds: float  # Computing time, s
     failure: str  # The exception, or an empty string
+    text: str = ""  # JSON of the report
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,7 @@ class FinishedWindow:
     report: Report
     after: PackedState
     seconds: float  # Computing time, s
+    text: str  # JSON of the report
 
 
 class Machine:
@@ -174,7 +176,7 @@ class Machine:
         before, self.packed = self.packed, result.state.with_plan_of(self.packed)
         self.finished += 1
         self.windower.records = self.next_state().records if self._changes else self.packed.records
-        return FinishedWindow(before, result.window, result.report, self.packed, result.seconds)
+        return FinishedWindow(before, result.window, result.report, self.packed, result.seconds, result.text)
 
     def put_back(self) -> None:
         """Let the window of a worker that died wait again, once; then it is missed."""

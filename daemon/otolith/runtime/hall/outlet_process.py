@@ -67,10 +67,10 @@ class OutletProcess:
             self._unserved[key] = own
         self._change(key, is_gone)
 
-    def offer(self, document: ReportDocument) -> None:
-        """Give it a report, without waiting."""
+    def offer(self, document: ReportDocument, text: str = "") -> None:
+        """Give it a report, without waiting; ``text`` is its JSON, if it was made already."""
         key = f"{document.site}/{document.machine}"
-        if key in self._machines and not self._send(key, (self.dropped, document.to_json().encode())):
+        if key in self._machines and not self._send(key, (self.dropped, (text or document.to_json()).encode())):
             self.dropped += 1
 
     def outage(self, key: str) -> str:
