@@ -23,6 +23,7 @@ from otolith.acquisition.samples import (
     has_equal_times,
     interval_of,
     merge_equal_times,
+    quantile_of,
     stale_repeats,
 )
 from otolith.acquisition.window import Array, GridSpan, Quality, Verdict
@@ -47,6 +48,11 @@ def test_one_sample_is_left_for_each_time(samples: list[tuple[int, float]], hold
         assert value == (same[-1] if hold == "zoh" else pytest.approx(same.mean(), abs=1e-9))
         if (same == same[0]).all():
             assert value == same[0]  # bit for bit: each row twice gives the samples of each row once
+
+
+@given(st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=60), st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]))
+def test_a_quantile_is_that_of_numpy_bit_for_bit(values: list[float], share: float) -> None:
+    assert quantile_of(np.array(values), share) == float(np.quantile(values, share))
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=30))

@@ -59,6 +59,26 @@ def test_every_sample_is_in_exactly_one_window() -> None:
         assert after.start == pytest.approx(before.end, abs=PERIOD / 4)
 
 
+@pytest.mark.parametrize("off_grid", [0.0, 0.0015])
+@pytest.mark.parametrize("repeated", [False, True])
+def test_signals_that_come_together_have_the_samples_that_each_has_alone(off_grid: float, repeated: bool) -> None:
+    random, names = np.random.default_rng(5), ("a", "b", "c")
+    moments = 0.1 + PERIOD * np.arange(4.0 * RECORDS) + off_grid * random.uniform(size=4 * RECORDS)
+    moments = np.sort(np.concatenate([moments, moments[70:75]])) if repeated else moments
+    samples = [Sample(name, time, float(random.normal())) for time in moments.tolist() for name in names]
+    aligned = {}
+    for group in (names, *((name,) for name in names)):
+        rings, windower = Rings(group, 8 * RECORDS), Windower(plans(*group, sampling=Sampling.TRUE), RECORDS, PERIOD)
+        rings.deliver([sample for sample in samples if sample.signal in group])
+        assert windower.begin(rings, 0.0, 0.0)
+        aligned[group] = [windower.take(rings, 0.0).samples for _ in range(3)]
+    for name in names:
+        for together, alone in zip(aligned[names], aligned[name,], strict=True):
+            assert np.array_equal(together.series[name].times, alone.series[name].times)
+            assert np.array_equal(together.series[name].values, alone.series[name].values)
+            assert (name in together.cyclic) == (name in alone.cyclic) == (not off_grid)
+
+
 @pytest.mark.parametrize("drift", often([-2e-3, 2e-4], [-2e-3, -2e-4, 2e-4, 2e-3]))
 def test_the_grid_follows_a_source_with_clock_drift(drift: float) -> None:
     samples = [(0.1 + index * PERIOD * (1 + drift), float(index)) for index in range(6000)]

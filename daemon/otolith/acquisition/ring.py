@@ -58,19 +58,32 @@ class Ring:
         self._newest = -math.inf
         self._unordered_until = 0  # count up to which a sample may be older than one that came before it
         self._overwritten = 0
-        self._new_times: list[float] = []  # Of the newest samples, which are not yet in the arrays
-        self._new_values: list[float] = []
+        self.new_times: list[float] = []
+        """Of the newest samples, which are not yet in the arrays, s: what is added here and to the values is appended.
+
+        Once there are ``GATHERED`` of them, :meth:`gather` is due.
+        """
+        self.new_values: list[float] = []
 
     @property
     def overwritten(self) -> int:
         """Samples that were overwritten before a window had read them."""
-        self._gather()
+        if not self._has_room():
+            self.gather()
         return self._overwritten
+
+    def _has_room(self) -> bool:
+        """Whether the newest samples take the places of read ones only, as nearly always: they need not be gathered."""
+        capacity, last = len(self._times), self._count + len(self.new_times) - 1
+        if last < capacity or not self.new_times:
+            return True
+        is_ordered = self._unordered_until <= self._count - capacity
+        return bool(last - capacity < self._count and is_ordered and self._times[last % capacity] < self._read_up_to)
 
     @property
     def state(self) -> RingState:
         """All of the ring, with copies of its samples."""
-        self._gather()
+        self.gather()
         held = min(self._count, len(self._times))
         return RingState(
             len(self._times),
@@ -93,23 +106,16 @@ class Ring:
         ring._unordered_until, ring._overwritten = state.unordered_until, state.overwritten
         return ring
 
-    def append(self, time: float, value: float) -> None:
-        """Add a sample: ``time`` in s, ``value`` NaN where the source had no reading."""
-        self._new_times.append(time)
-        self._new_values.append(value)
-        if len(self._new_times) >= GATHERED:
-            self._gather()
-
     def extend(self, times: Array, values: Array) -> None:
-        """Add many samples (s, value) at once, with the same result as :meth:`append` for each."""
-        self._gather()
+        """Add many samples at once: times (s) and values, NaN where the source had no reading."""
+        self.gather()
         self._extend(times, values)
 
-    def _gather(self) -> None:
+    def gather(self) -> None:
         """Put the newest samples into the arrays: of many at once it takes much less time."""
-        if self._new_times:
-            times, values = np.array(self._new_times), np.array(self._new_values)
-            self._new_times, self._new_values = [], []
+        if self.new_times:
+            times, values = np.array(self.new_times), np.array(self.new_values)
+            self.new_times, self.new_values = [], []
             self._extend(times, values)
 
     def _extend(self, times: Array, values: Array) -> None:
@@ -131,10 +137,10 @@ class Ring:
 
         Samples before ``read_until`` (s) are marked as read: if they are overwritten, they are not lost.
         """
-        self._gather()
+        self.gather()
         parts = []
         for times, values in reversed(self._ordered()):
-            first, last = (int(index) for index in np.searchsorted(times, (start, end)))
+            first, last = times.searchsorted((start, end)).tolist()
             parts.append((times[first:last], values[first:last]))
             if first > 0 and (latest := _last_finite(values[:first])) is not None:
                 before = slice(latest, latest + 1)
@@ -158,13 +164,13 @@ class Ring:
 
     def first_time(self) -> float:
         """Return the time of the oldest sample still held, s; infinity if there is none."""
-        self._gather()
+        self.gather()
         return float(self._times[: min(self._count, len(self._times))].min(initial=math.inf))
 
     def last_time(self) -> float:
         """Return the time of the newest sample, s; minus infinity if there is none."""
-        if self._new_times:
-            return self._new_times[-1]
+        if self.new_times:
+            return self.new_times[-1]
         return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
 
 
@@ -201,14 +207,19 @@ class Rings:
 
     def deliver(self, samples: Sequence[Sample]) -> None:
         """Take the samples of a driver; called from the driver's thread."""
+        is_finite, ring_of, received = math.isfinite, self._rings.get, 0
         with self._lock:
             for signal, time, value in samples:
-                ring = self._rings.get(signal)
-                if ring is None:
+                if (ring := ring_of(signal)) is None:
                     self._unknown += 1
-                else:
-                    ring.append(time, value)
-                    self._received += math.isfinite(value)
+                    continue
+                ring.new_times.append(time)
+                ring.new_values.append(value)
+                received += is_finite(value)
+            self._received += received
+            for ring in self._rings.values():
+                if len(ring.new_times) >= GATHERED:
+                    ring.gather()
 
     def deliver_columns(self, columns: Mapping[str, tuple[Array, Array]]) -> None:
         """Take many samples at once: times (s) and values of each signal, in the order of their arrival."""

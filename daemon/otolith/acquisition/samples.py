@@ -10,6 +10,7 @@ they are slots of the grid if that period is a whole multiple of the grid's. Not
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,7 @@ class Series:
 
     def within(self, start: float, end: float) -> "Series":
         """Return the samples with ``start <= time < end``."""
-        first, last = np.searchsorted(self.times, (start, end))
+        first, last = self.times.searchsorted((start, end))
         return Series(self.times[first:last], self.values[first:last])
 
 
@@ -265,20 +266,40 @@ def _arrival_phase(times: Array, span: GridSpan) -> float:
 
 def align_to_grid(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
     """Return the samples of a signal in the slots ``start + k * period``, as :func:`align` does."""
-    start, period = span.start, span.period
-    near = samples.within(start - grace, span.end + grace)
-    kept, slots = _assign_slots(near.times, np.rint((near.times - start) / period))
-    at: Array = np.asarray(start + slots * period)
-    inside = (slots >= 0) & (slots < span.records)
-    before = samples.within(-np.inf, min(start - grace, float(at[0]) if len(at) else np.inf))
-    after = samples.within(max(span.end + grace, float(at[-1]) + period / 2 if len(at) else -np.inf), np.inf)
-    series = merge_equal_times(  # those before and after the window may have equal times
-        np.concatenate([before.times, at, after.times]),
-        np.concatenate([before.values, near.values[kept], after.values]),
-        "zoh",
-    )
-    surplus = len(near.times) - len(kept)
-    return CyclicSeries(series, (near.times[kept] - at)[inside], on_grid=True, surplus=surplus)
+    return SlotsOnGrid.of(samples.times, span, grace).filled(samples.values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlotsOnGrid:
+    """The slots of samples with these times: the same for all signals that were sampled together."""
+
+    chosen: Indices  # The samples that have a slot, or are before or after those
+    times: Array  # Of their slots
+    is_rising: bool  # Whether no two of these are equal
+    lateness: Array  # As in CyclicSeries, like what follows
+    surplus: int
+
+    @classmethod
+    def of(cls, times: Array, span: GridSpan, grace: float) -> Self:
+        """Return the slots for ``times`` (samples,), as :func:`align_to_grid` does."""
+        start, period = span.start, span.period
+        first, last = times.searchsorted((start - grace, span.end + grace)).tolist()
+        near = times[first:last]
+        kept, slots = _assign_slots(near, np.rint((near - start) / period))
+        at: Array = np.asarray(start + slots * period)
+        inside = (slots >= 0) & (slots < span.records)
+        until = times.searchsorted(min(start - grace, float(at[0]) if len(at) else np.inf))
+        since = times.searchsorted(max(span.end + grace, float(at[-1]) + period / 2 if len(at) else -np.inf))
+        every = np.concatenate([times[:until], at, times[since:]])
+        chosen = np.concatenate([np.arange(until), first + kept, np.arange(since, len(times))])
+        return cls(chosen, every, not has_equal_times(every), (near[kept] - at)[inside], len(near) - len(kept))
+
+    def filled(self, values: Array) -> CyclicSeries:
+        """Return the samples with these values (samples,) in their slots."""
+        own = values[self.chosen]
+        # Those before and after the window may have equal times.
+        series = Series(self.times, own) if self.is_rising else merge_equal_times(self.times, own, "zoh")
+        return CyclicSeries(series, self.lateness, on_grid=True, surplus=self.surplus)
 
 
 def _own_clock(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
@@ -316,6 +337,15 @@ def _own_clock(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
         start, period = span.start, span.period
     at: Array = np.asarray(start + slots * period)
     return CyclicSeries(Series(at, values[kept]), arrivals - at, on_grid, len(times) - len(kept), irregularity)
+
+
+def quantile_of(values: Array, share: float) -> float:
+    """Return what ``np.quantile`` does, for a ``share`` from 0 to 1 of finite ``values``, in a tenth of the time."""
+    last = len(values) - 1
+    first = int(place := share * last)
+    ordered, part = np.partition(values, (first, min(first + 1, last))), place - first
+    low, high = float(ordered[first]), float(ordered[min(first + 1, last)])
+    return high - (high - low) * (1.0 - part) if part >= 0.5 else low + (high - low) * part
 
 
 def irregularity_of(times: Array) -> float:

@@ -19,15 +19,16 @@ from otolith.acquisition.samples import (
     CyclicSeries,
     Series,
     SignalPlan,
+    SlotsOnGrid,
     align,
     align_delayed,
-    align_to_grid,
     finite_samples,
     has_equal_times,
     has_period,
     lies_on_grid,
     merge_equal_times,
     phase_of_grid,
+    quantile_of,
 )
 from otolith.acquisition.window import Array, GridSpan
 
@@ -191,14 +192,18 @@ class Windower:
 
     def _align(self, rings: Rings) -> AlignedSamples:
         series, repeated, ambiguous = dict[str, Series](), 0, dict[str, float]()
+        latest: Array | None = None  # Times without equal ones
         for name, plan in self.plans.items():
-            series[name], merged = self._samples(rings, plan)
+            series[name], merged = self._samples(rings, plan, latest)
+            if not plan.is_cyclic and merged is NO_SAMPLES:
+                latest = series[name].times
             repeated += merged.repeated
             if merged.differing:
                 ambiguous[name] = merged.differing / (len(merged.times) + merged.repeated)
         true = [name for name, plan in self.plans.items() if not plan.is_cyclic and self._has_clock_of_grid(plan)]
         self._adopt_phase([series[name] for name in true])
         aligned: dict[str, CyclicSeries] = {}
+        slots: dict[int, SlotsOnGrid | None] = {}  # By the array of times, which signals that come together share
         for name, plan in self.plans.items():
             if plan.is_cyclic and not self._has_clock_of_grid(plan):
                 arrivals = self._arrivals(plan, series)
@@ -207,8 +212,13 @@ class Windower:
                 aligned[name] = align_delayed(series[name], plan.delay, self._span(), GRACE_PERIOD)
             elif plan.is_cyclic:
                 aligned[name] = align(series[name], self._span(), GRACE_PERIOD)
-            elif self._is_on_grid(series[name]):
-                aligned[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
+            else:
+                times = series[name].times
+                if id(times) not in slots:
+                    is_on_grid = self._is_on_grid(series[name])
+                    slots[id(times)] = SlotsOnGrid.of(times, self._span(), GRACE_PERIOD) if is_on_grid else None
+                if (own := slots[id(times)]) is not None:
+                    aligned[name] = own.filled(series[name].values)
             series[name] = aligned[name].series if name in aligned else series[name]
         return AlignedSamples(series, aligned, repeated, ambiguous)
 
@@ -226,16 +236,19 @@ class Windower:
         ]
         return np.sort(np.concatenate(together)) if together else None
 
-    def _samples(self, rings: Rings, plan: SignalPlan) -> tuple[Series, Series]:
+    def _samples(self, rings: Rings, plan: SignalPlan, latest: Array | None) -> tuple[Series, Series]:
         """Return the samples of a signal from one window before this one until after it, and the one before them.
 
-        The second series has those of this window alone, if some have equal times; it is empty otherwise.
+        The second series has those of this window alone, if some have equal times; it is empty otherwise. Times like
+        the ``latest`` ones of another signal, none of which are equal, are the same array.
         """
         start, end = self._start - self.length + plan.delay, self.next_end + max(self.grace, self.length) + plan.delay
         times, values = finite_samples(*rings.around(plan.name, start, end, self.next_end + plan.delay))
         if plan.is_cyclic:  # the alignment subtracts the delay
             return Series(times, values), NO_SAMPLES
         times = times - plan.delay if plan.delay else times
+        if latest is not None and np.array_equal(times, latest):
+            return Series(latest, values), NO_SAMPLES
         if not has_equal_times(times):
             return Series(times, values), NO_SAMPLES
         here = slice(*np.searchsorted(times, (self._start, self.next_end)))
@@ -267,9 +280,12 @@ class Windower:
 
         A signal without two samples in sight has its last known interval.
         """
+        usual: dict[int, float] = {}  # As the slots of _align
         for name, samples in series.items():
-            if self.plans[name].needs_next_sample and len(samples.times) > 1:
-                self._intervals[name] = float(np.median(np.diff(samples.times)))
+            if self.plans[name].needs_next_sample and len(times := samples.times) > 1:
+                if id(times) not in usual:
+                    usual[id(times)] = float(np.median(np.diff(times)))
+                self._intervals[name] = usual[id(times)]
         slowest = max(self._intervals.values(), default=0.0)
         return float(np.clip(SLOW_GRACE * slowest, GRACE_PERIOD, max(self.length, GRACE_PERIOD)))
 
@@ -285,7 +301,7 @@ def _grid_shift(aligned: Mapping[str, CyclicSeries], *, first: bool, period: flo
     halves = [(len(late) // 2, late) for late in lateness]
     if not halves:
         return 0.0
-    early = float(np.quantile(np.concatenate([late[:half] for half, late in halves]), PUNCTUAL_QUANTILE))
-    late = float(np.quantile(np.concatenate([late[half:] for half, late in halves]), PUNCTUAL_QUANTILE))
+    early = quantile_of(np.concatenate([late[:half] for half, late in halves]), PUNCTUAL_QUANTILE)
+    late = quantile_of(np.concatenate([late[half:] for half, late in halves]), PUNCTUAL_QUANTILE)
     shift = late + (0.5 * (early - late) if first else 1.5 * (late - early))
     return float(np.clip(shift, -period / 2, period / 2))

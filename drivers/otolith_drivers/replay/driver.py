@@ -10,9 +10,11 @@ import logging
 import math
 import threading
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -28,7 +30,8 @@ from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds
 
 # Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
 CHUNK_POLL = 0.005  # s between two looks whether a chunk is read
-GATHERED = 0.05  # s between two deliveries at least: their rows have their own times, and a wake-up costs more than one
+GATHERED, MAX_GATHERED = 0.05, 0.1  # s between two deliveries at least: rows have their own times, and waking up costs
+DELIVERIES = 1000  # per second in a process; of more the rows are gathered for longer
 MAX_WAIT = 10.0  # s; the times of rows are taken from the clock at least so often
 ROWS_MADE_AT_ONCE = 100  # whose samples are made together
 MAX_ROWS_AT_ONCE = 500  # delivered together; bounds how long one call of deliver() takes
@@ -152,7 +155,8 @@ class ReplayDriver:
         silence = self._clock - time.monotonic()
         if self._paced and not reason and silence > SILENCE_WARNING:
             warnings.append(f"the next row of the file comes in {silence:.0f} s")
-        return Link(up=not reason, reason=reason, warnings=tuple(warnings))
+        latency = gathered() - GATHERED if self._paced else 0.0
+        return Link(up=not reason, reason=reason, warnings=tuple(warnings), latency=latency)
 
     def describe(self) -> list[str]:
         return self._description
@@ -191,23 +195,28 @@ class ReplayDriver:
 
     def _deliver(self, rows: Rows, times: Array, deliver: Deliver) -> Playing:
         """Deliver each row at its time; a row that goes back in time comes with the row above it."""
-        clock = np.maximum.accumulate(np.maximum(times, self._clock))
+        due: list[float] = np.maximum.accumulate(np.maximum(times, self._clock)).tolist()
         at, ready = 0, SamplesOfRows(rows, times)
-        while at < len(clock) and not self._stop.is_set():
-            now, until = time.monotonic(), min(at + MAX_ROWS_AT_ONCE, len(clock))
+        while at < len(due) and not self._stop.is_set():
+            now, until = time.monotonic(), min(at + MAX_ROWS_AT_ONCE, len(due))
             if self._paced:
-                until = min(until, int(np.searchsorted(clock, now, side="right")))
+                until = bisect_right(due, now, at, until)
             if until > at:
                 samples = ready.take(at, until)
                 self._received += len(samples)
                 self._bad = self._bad_before + int(rows.bad[until - 1])
                 deliver(samples)
-                self._clock, at = float(clock[until - 1]), until
-            if self._paced and at < len(clock):
-                self._clock = float(clock[at])
-                yield min(max(self._clock, now + GATHERED), now + MAX_WAIT)
+                self._clock, at = due[until - 1], until
+            if self._paced and at < len(due):
+                self._clock = due[at]
+                yield min(max(self._clock, now + gathered()), now + MAX_WAIT)
             else:
                 yield now
+
+
+def gathered() -> float:
+    """Return for how long rows are gathered at least, s: a process that plays many recordings wakes up too often."""
+    return min(max(GATHERED, player.playing / DELIVERIES), MAX_GATHERED)
 
 
 def _result(asked: "Future[Read]") -> Generator[float, None, Read]:
@@ -244,6 +253,7 @@ class SamplesOfRows:
         present = np.isfinite(values)
         at, column = np.nonzero(present)
         named = map(names.__getitem__, column.tolist())
-        self._made = list(map(Sample, named, self._times[part][at].tolist(), values[present].tolist()))
+        rows = zip(named, self._times[part][at].tolist(), values[present].tolist(), strict=True)
+        self._made = list(map(tuple.__new__, repeat(Sample), rows))  # as Sample(...) for each, in half of the time
         self._before = [0, *np.cumsum(present.sum(axis=1)).tolist()]
         self._begin, self._end = first, last

@@ -39,6 +39,8 @@ class _Player:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._due: list[tuple[float, int, Played]] = []
+        self.playing = 0
+        """Number of recordings that are played."""
         self._numbers = itertools.count()
         self._thread: threading.Thread | None = None
 
@@ -46,6 +48,7 @@ class _Player:
         """Step the iterator from now on, until it ends."""
         played = Played(steps)
         with self._changed:
+            self.playing += 1
             heapq.heappush(self._due, (time.monotonic(), next(self._numbers), played))
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
@@ -69,6 +72,8 @@ class _Player:
                 log.exception("a recording is no longer played")
                 due = None
             if due is None:
+                with self._changed:
+                    self.playing -= 1
                 played.ended.set()
                 continue
             with self._changed:

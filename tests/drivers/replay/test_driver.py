@@ -12,7 +12,16 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay.driver import GATHERED, Options, ReplayDriver, SamplesOfRows, Source, build
+from otolith_drivers.replay.driver import (
+    GATHERED,
+    MAX_GATHERED,
+    Options,
+    ReplayDriver,
+    SamplesOfRows,
+    Source,
+    build,
+)
+from otolith_drivers.replay.player import player
 from otolith_drivers.replay.readers import Rows
 from otolith_drivers.replay.table import reader as table
 from tests.conftest import EXAMPLES, SIGNALS
@@ -85,6 +94,21 @@ def test_replay_in_real_time_delivers_no_sample_early(tmp_path: Path) -> None:
     assert len(late) == 198
     assert min(late) >= 0.0
     assert float(np.median(late)) < 0.5 * GATHERED + within(0.02)
+
+
+def test_many_recordings_wake_their_thread_less_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is gathered for longer is late by so much more, and the link says so: a window waits for it."""
+    path, deliveries = written_table(tmp_path, 100), list[int]()
+    monkeypatch.setattr(player, "playing", 0)
+    alone = driver_of(path).link().latency
+    monkeypatch.setattr(player, "playing", 1000)
+    driver = driver_of(path)
+    assert alone == 0.0
+    assert driver.link().latency == pytest.approx(MAX_GATHERED - GATHERED)
+    driver.open(lambda samples: deliveries.append(len(samples)))
+    wait_for(lambda: not driver.link().up)
+    assert sum(deliveries) == 198
+    assert len(deliveries) <= 1.0 / MAX_GATHERED + 2
 
 
 def test_replay_waits_for_a_slow_receiver(tmp_path: Path) -> None:
