@@ -117,7 +117,8 @@ def _recorded(
             return None
         if not has_room(content.path):
             return Ended("")
-        recordings[name] = RotatedRecording(content.path, content.source, content.folder, time.time())
+        phase = len(recordings) / BATCH_WINDOWS % 1.0  # else those that began together always write together
+        recordings[name] = RotatedRecording(content.path, content.source, content.folder, time.time(), phase)
         return None
     if name not in recordings:
         return None  # it has ended, which was answered before
@@ -136,13 +137,16 @@ def has_room(path: Path) -> bool:
 class RotatedRecording:
     """A recording in one file, or in a folder with a new file when one is full. Times are Unix seconds."""
 
-    def __init__(self, path: Path, source: RecordedMachine, folder: RecordingFolder | None, now: float) -> None:
+    def __init__(
+        self, path: Path, source: RecordedMachine, folder: RecordingFolder | None, now: float, phase: float = 0.0
+    ) -> None:
+        """``phase`` as of :class:`Recording`."""
         self.path = path
         self._folder = folder
         self._begin = self._checked_at = now
         self._marked_until = -math.inf
         self._unite_others()
-        self._recording = Recording(path, source, None if folder is None else FILE_MODE)
+        self._recording = Recording(path, source, None if folder is None else FILE_MODE, phase)
         self._set_mode()
 
     @property
@@ -199,9 +203,10 @@ class RotatedRecording:
 class Recording:
     """A stream of windows into ``.rrd`` files, one after the other, and their samples into Parquet files."""
 
-    def __init__(self, path: Path, source: RecordedMachine, mode: int | None = None) -> None:
-        """``mode`` is that of the files with samples."""
+    def __init__(self, path: Path, source: RecordedMachine, mode: int | None = None, phase: float = 0.0) -> None:
+        """``mode`` is that of the files with samples; ``phase`` the share of a batch by which the first is shorter."""
         self._source, self._mode = source, mode
+        self._batch = BATCH_WINDOWS - round(phase * BATCH_WINDOWS)  # Windows that are written together
         self._samples: SampleWriter | None = None
         self._stream = rr.RecordingStream(APPLICATION, recording_id=re.sub(r"\W+", "_", source.title))
         self._stream.set_log_time_enabled(False)
@@ -265,8 +270,9 @@ class Recording:
         self._add_document(document)
         self.waiting += 1
         age = time.monotonic() - self._written_at
-        if self.waiting >= BATCH_WINDOWS or age >= BATCH_SECONDS or announcements(document):
+        if self.waiting >= self._batch or age >= BATCH_SECONDS or announcements(document):
             self.write()
+            self._batch = BATCH_WINDOWS
 
     def write(self) -> None:
         """Write the windows that wait."""

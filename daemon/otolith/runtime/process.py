@@ -8,11 +8,13 @@ itself when the daemon has died.
 import contextlib
 import gc
 import logging
+import math
 import multiprocessing
 import multiprocessing.connection
 import os
 import queue
 import resource
+import select
 import signal
 import subprocess
 import sys
@@ -40,7 +42,19 @@ MAX_RUNNING = 2  # commands at a time
 MAX_WAITING_EVENTS = 64  # events that wait for a command; later ones are dropped and counted
 COMMAND_TIMEOUT = 30.0  # s until a command is killed with all processes of its session
 PRIVATE_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")  # With them a command could notify systemd
+READY_BYTES = 4096  # that are read at once of those that say that there are messages
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+
+def wait_for(waitables: Sequence[Any], seconds: float) -> bool:
+    """Wait for up to ``seconds`` until one of the descriptors, or of what has one, is ready; return whether one is.
+
+    ``multiprocessing.connection.wait`` takes as much processor time for it as the main thread has for a whole window.
+    """
+    poll = select.poll()
+    for each in waitables:
+        poll.register(each, select.POLLIN)
+    return bool(poll.poll(max(0.0, math.ceil(1e3 * seconds))))
 
 
 def spare_collections() -> None:
@@ -80,6 +94,7 @@ class _Inbox:
         self._messages: deque[Any] = deque()
         self.ready, self._ready = multiprocessing.connection.Pipe(duplex=False)
         """Readable as soon as there is a message, or the child has ended."""
+        os.set_blocking(self.ready.fileno(), False)
         self._thread = threading.Thread(target=self._receive, args=(name, connection), name=f"from-{name}", daemon=True)
         self._thread.start()
 
@@ -90,9 +105,9 @@ class _Inbox:
 
     def take(self) -> list[Any]:
         """Return the messages received since the last call, without waiting."""
-        with contextlib.suppress(EOFError):
-            while self.ready.poll():
-                self.ready.recv_bytes()
+        with contextlib.suppress(BlockingIOError):
+            while os.read(self.ready.fileno(), READY_BYTES):
+                pass
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def _receive(self, name: str, connection: multiprocessing.connection.Connection) -> None:
@@ -225,7 +240,7 @@ class ChildProcess:
 
     @property
     def waitables(self) -> list[Any]:
-        """Arguments for :func:`multiprocessing.connection.wait`: ready on a reply, and when the process has died."""
+        """Arguments for :func:`wait_for`: ready on a reply, and when the process has died."""
         if not self.alive:
             return []
         if self._inbox is None or not self._inbox.is_open:  # a closed one would always be ready

@@ -1,12 +1,11 @@
 """Worker processes of this computer for a batch of replays; one that ends is started again."""
 
-import multiprocessing.connection
 import time
 from typing import Any
 
 from otolith import kernel_cache
 from otolith.runtime.batch.task import TASK_TIMEOUT, ReplayOutcome, ReplayTask, perform_task
-from otolith.runtime.process import ChildProcess
+from otolith.runtime.process import ChildProcess, wait_for
 from otolith_drivers.errors import OtolithError
 
 POLL = 0.2  # s between two looks at the workers, if none of them answers; the reaction time to a signal
@@ -62,7 +61,7 @@ class LocalWorkers:
         """Wait for a moment, and return what was finished: key, outcome, and why there is none."""
         waitables = [waitable for worker in self._workers for waitable in worker.waitables]
         if waitables:
-            multiprocessing.connection.wait(waitables, timeout=POLL)
+            wait_for(waitables, POLL)
         else:
             time.sleep(POLL)
         done = list[tuple[str, ReplayOutcome | None, str]]()

@@ -13,6 +13,7 @@ closes what is no longer served and opens what is new, one machine after the oth
 import contextlib
 import heapq
 import logging
+import math
 import os
 import signal
 import sqlite3
@@ -22,7 +23,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
 
@@ -39,7 +39,7 @@ from otolith.runtime.hall.notifier import Notifier
 from otolith.runtime.hall.outlet_process import OutletProcess
 from otolith.runtime.hall.pool import Pool, Preparation
 from otolith.runtime.hall.recorder_process import RecorderProcess
-from otolith.runtime.process import SIGNALS, spare_collections
+from otolith.runtime.process import SIGNALS, spare_collections, wait_for
 from otolith.runtime.service import OUTLET_FLUSH, Service, SharedParts
 from otolith.storage.disk import StorageThread
 from otolith.storage.state_store import LockedError
@@ -49,7 +49,8 @@ log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
-LOOK_INTERVAL = 0.1  # s between two looks at the recorder, and whether windows are being finished
+LOOK_INTERVAL = 0.1  # s between two looks at some of the recordings, and whether windows are being finished
+LOOKS = 10  # by which a hall has looked at the recordings of all of its machines
 MIN_WORKERS = 2  # of a hall: a window that takes long leaves one to the others
 STATUS_INTERVAL = 2.0  # s between two lines for systemd about a hall
 STORAGE_FLUSH, STORAGE_FLUSH_OF_MACHINE = 1.5, 0.03  # s to finish writing at the end of a hall, and for each machine
@@ -71,6 +72,7 @@ class Daemon:
         self._preparation: Preparation | None = None  # As it was shown
         self._stop_signal: int | None = None
         self._is_reload_due = self._is_reloading = False
+        self._unseen: list[Service] = []  # Those that :meth:`_look` has not looked at yet in this turn
         self._fed_at = self._watchdog_at = self._recorders_at = self._status_at = 0.0
 
     def run(self) -> int:
@@ -285,7 +287,7 @@ class Daemon:
             _, number, machine = heapq.heappop(self._due)
             heapq.heappush(self._due, (self._take_due(machine, now), number, machine))
         due = self._due[0][0] if self._due else now + MAX_WAIT  # all may begin anew at once
-        wait(self._pool.waitables, timeout=min(MAX_WAIT, due - now))
+        wait_for(self._pool.waitables, min(MAX_WAIT, due - now))
         for machine, finished in self._pool.poll(time.monotonic()):
             if (service := self._services.get(machine)) is None:
                 continue
@@ -302,14 +304,22 @@ class Daemon:
             self._feed_watchdog(now)
         if now - self._recorders_at >= LOOK_INTERVAL or self._is_alone:
             self._recorders_at = now
-            for service in self._served:
-                with self._guarded(service):
-                    service.poll_processes(now)
-                if service.locked_out is not None:
-                    with self._alone_or_left_out(service):
-                        raise service.locked_out
+            self._look(now)
             if not (self._services or self._is_reloading):
                 raise ServiceError("no machine is served any more: the lines above say why")
+
+    def _look(self, now: float) -> None:
+        """Look at the processes and the lock of some machines, in turn: for all of them it takes milliseconds."""
+        for _ in range(math.ceil(len(self._services) / LOOKS)):
+            self._unseen = self._unseen or self._served
+            service = self._unseen.pop()
+            if self._services.get(service.machine) is not service:  # it was withdrawn meanwhile
+                continue
+            with self._guarded(service):
+                service.poll_processes(now)
+            if service.locked_out is not None:
+                with self._alone_or_left_out(service):
+                    raise service.locked_out
 
     def _take_due(self, machine: Machine, now: float) -> float:
         """Submit the windows of a machine that are due; return when to ask it again."""

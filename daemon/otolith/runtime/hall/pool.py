@@ -139,7 +139,7 @@ class Pool:
 
     @property
     def waitables(self) -> list[Any]:
-        """Arguments for :func:`multiprocessing.connection.wait`: ready on a reply, and when a process has died."""
+        """Arguments for :func:`otolith.runtime.process.wait_for`: ready on a reply, and when a process has died."""
         return [waitable for worker in self.workers for waitable in worker.process.waitables]
 
     def start(self, now: float) -> None:
