@@ -95,8 +95,9 @@ class Daemons:
         service.publisher = self  # type: ignore[assignment]
         return service
 
-    def publish(self, document: ReportDocument) -> None:
-        """Keep what the daemon publishes."""
+    def publish(self, document: ReportDocument, text: str) -> None:
+        """Keep what the daemon publishes, whose JSON is that of the report."""
+        assert text == document.to_json()
         self.published.append(document)
 
     def warn_of_expiry(self, _: object) -> None:
