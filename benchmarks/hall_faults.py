@@ -155,11 +155,12 @@ class FaultyHall:
             self.reports[document.machine].append(document)
 
     def children(self, daemon: "subprocess.Popen[bytes]") -> tuple[psutil.Process, psutil.Process]:
-        """A worker and the recorder, which is started last."""
+        """The oldest worker, and the recorder, which has recordings open."""
         children = psutil.Process(daemon.pid).children()
         spawned = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
-        first, *_, last = sorted(spawned, key=lambda child: child.create_time())
-        return first, last
+        recorders = [child for child in spawned if any(file.path.endswith(".rrd") for file in child.open_files())]
+        workers = sorted((child for child in spawned if child not in recorders), key=lambda child: child.create_time())
+        return workers[0], recorders[0]
 
     def during(self, trouble: str, act: Callable[[], None], seconds: float) -> FaultFigures:
         """Let something happen, and return what it cost the machines that are well."""
