@@ -36,11 +36,13 @@ from benchmarks.hall import PATIENCE, SETTLING, WINDOW, environment_of_unit, wri
 from otolith.health.schema import CountersDocument, ReportDocument
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
+from otolith.storage.disk import WRITE_RETRY
 from otolith.storage.history import SUFFIX, HistoryReader
 
 SITE = "hall"
 DISK = 1000  # MB of the state
 STOPPED = 3.0  # s for which the daemon is stopped
+WRITING = 5.0  # s after the next try to write, in which all that has waited for the disk is written
 RECORDED = 90.0  # s of the records, which are repeated
 STRICT = "nothing", "a worker killed", "the recorder killed", "a worker stopped", "the recorder stopped", "disk full"
 """Troubles during which every machine that is well must be on time."""
@@ -155,12 +157,17 @@ class FaultyHall:
             self.reports[document.machine].append(document)
 
     def children(self, daemon: "subprocess.Popen[bytes]") -> tuple[psutil.Process, psutil.Process]:
-        """The oldest worker, and the recorder, which has recordings open."""
-        children = psutil.Process(daemon.pid).children()
-        spawned = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
-        recorders = [child for child in spawned if any(file.path.endswith(".rrd") for file in child.open_files())]
-        workers = sorted((child for child in spawned if child not in recorders), key=lambda child: child.create_time())
-        return workers[0], recorders[0]
+        """The oldest worker, and the recorder, once it has recordings open: it may have been started just now."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            children = psutil.Process(daemon.pid).children()
+            spawned = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+            recorders = [child for child in spawned if any(file.path.endswith(".rrd") for file in child.open_files())]
+            workers = sorted((child for child in spawned if child not in recorders), key=lambda own: own.create_time())
+            if recorders and workers:
+                return workers[0], recorders[0]
+            time.sleep(0.1)
+        raise SystemExit(f"no recorder or no worker in {PATIENCE:g} s")
 
     def during(self, trouble: str, act: Callable[[], None], seconds: float) -> FaultFigures:
         """Let something happen, and return what it cost the machines that are well."""
@@ -217,7 +224,7 @@ def run_troubles(hall: FaultyHall, seconds: float, *, has_disk: bool) -> list[Fa
         if has_disk:
             rows.append(hall.during("disk full", lambda: fill(hall.state), seconds))
             (hall.state / "ballast").unlink()
-            rows.append(hall.during("disk has room again", lambda: None, seconds))
+            rows.append(hall.during("disk has room again", lambda: None, max(seconds, WRITE_RETRY + WRITING)))
 
         def stop_all() -> None:
             daemon.send_signal(signal.SIGSTOP)
