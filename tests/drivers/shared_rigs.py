@@ -38,8 +38,8 @@ def sockets(port: int, *, local: bool) -> Callable[[], int]:
     """Count the sockets of this process that are bound or connected to ``port``."""
 
     def count() -> int:
-        found = psutil.Process().net_connections("inet")
-        ends = [each.laddr if local else each.raddr for each in found if each.status in ("ESTABLISHED", "NONE")]
+        sockets = psutil.Process().net_connections("inet")
+        ends = [each.laddr if local else each.raddr for each in sockets if each.status in ("ESTABLISHED", "NONE")]
         return sum(bool(end) and end.port == port for end in ends)
 
     return count

@@ -193,7 +193,7 @@ def test_whoever_comes_while_a_connection_is_being_closed_gets_a_new_one(monkeyp
 
 
 def test_nobody_joins_a_connection_that_its_last_user_breaks_off() -> None:
-    """What comes after that gets a connection of its own, which nobody has broken off."""
+    """A user that joins while the last one breaks the connection off gets a new connection."""
     first, second, count = OtherDriver(), OtherDriver(), Line.opened
     first.open(lambda _: None)
     assert first._line is not None

@@ -203,7 +203,8 @@ class Windower:
         true = [name for name, plan in self.plans.items() if not plan.is_cyclic and self._has_clock_of_grid(plan)]
         self._adopt_phase([series[name] for name in true])
         aligned: dict[str, CyclicSeries] = {}
-        slots: dict[int, SlotsOnGrid | None] = {}  # By the array of times, which signals that come together share
+        # By the array of times, which signals that come together share; each array lives until its signals are aligned
+        slots: dict[int, SlotsOnGrid | None] = {}
         for name, plan in self.plans.items():
             if plan.is_cyclic and not self._has_clock_of_grid(plan):
                 arrivals = self._arrivals(plan, series)

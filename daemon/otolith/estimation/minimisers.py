@@ -219,8 +219,8 @@ class _Places:
         return len(self.positions)
 
     def get(self, *keys: str) -> Any:
-        found = [{"X": self.positions, "F": self.costs}[key] for key in keys]
-        return found if len(found) > 1 else found[0]
+        arrays = [{"X": self.positions, "F": self.costs}[key] for key in keys]
+        return arrays if len(arrays) > 1 else arrays[0]
 
 
 class _Swarm:

@@ -302,8 +302,8 @@ class _Subscription:
             if now - self._latest > limit:
                 raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
             if now >= retry:
-                found = await self._ask_again(client, subscription)
-                pause = FIRST_RETRY if found else min(2.0 * pause, LAST_RETRY)
+                is_any_there = await self._ask_again(client, subscription)
+                pause = FIRST_RETRY if is_any_there else min(2.0 * pause, LAST_RETRY)
                 retry = now + pause
 
     async def _look_up(self, client: Client, nodes: Sequence[NodeSignal]) -> None:

@@ -31,7 +31,7 @@ from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay import recording_child
 from otolith_drivers.replay.readers import Array, DamagedFileError, DataFile, Integers, Mask, Reader, Rows
 from otolith_drivers.replay.recording_child import END, FAULT, OPENED, PART, TIMES, TIMES_ENTITY, WINDOW
-from otolith_drivers.replay.sample_files import TimesRecord, meaning_of, rows_of
+from otolith_drivers.replay.sample_files import TimesRecord, first_line, meaning_of, rows_of
 from otolith_drivers.replay.sample_names import parts_folder, sample_files, viewing_file, whole_file
 from otolith_drivers.units import factor
 
@@ -185,7 +185,7 @@ class RecordingReader(Reader):
                 yield from self._rows(buffers, until)
         yield from self._rows(buffers, MAX_NS)
         if not self._records:
-            raise DamagedFileError(f"{self.path}: no records can be read")
+            raise DamagedFileError("; ".join([f"{self.path}: no records can be read", *self.warnings()]))
 
     def _rows(self, buffers: dict[str, "_SignalBuffer"], until: int) -> Iterator[Rows]:
         """The rows up to ``until`` (ns), one for each time at which any signal has a reading."""
@@ -237,7 +237,7 @@ class SamplesReader(RecordingReader):
             try:
                 meaning, count = meaning_of(file)
             except (ValueError, OSError) as error:
-                self._damages[file] = _reason(error)
+                self._damages[file] = first_line(error)
                 continue
             meanings, rows = [*meanings[:1], meaning], rows + count
             if meanings[0] != meaning:
@@ -265,11 +265,6 @@ class SamplesReader(RecordingReader):
     def warnings(self) -> list[str]:
         what = "is damaged, and left out or ends early"
         return [*super().warnings(), *(f"{file.name} {what}: {why}" for file, why in self._damages.items())]
-
-
-def _reason(error: Exception) -> str:
-    """Return the first line of an error of a library."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 class PackedReader(RecordingReader):

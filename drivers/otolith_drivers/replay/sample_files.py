@@ -121,6 +121,11 @@ def meaning_of(file: Path) -> tuple[TimesRecord, int]:
     return meaning, int(rows)
 
 
+def first_line(error: Exception) -> str:
+    """Return the first line of an error of a library, or its type if it says nothing."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
 def unite(recording: Path) -> None:
     """Make one file of the parts of a recording that has ended; parts that are damaged are left out.
 
@@ -217,6 +222,6 @@ def rows_of(path: Path, signals: int, rows: int) -> "Iterator[tuple[Integers, Ar
                     yield times, values, batch.column(signals + 1).to_numpy(zero_copy_only=False)
             except (pa.ArrowException, OSError, ValueError) as error:
                 is_told = True
-                yield next(iter(str(error).splitlines()), type(error).__name__)
+                yield first_line(error)
         if count != file.metadata.num_rows and not is_told:  # which the file says twice, without a checksum
             yield f"{count} records instead of {file.metadata.num_rows}"

@@ -200,6 +200,18 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return whole_file(path)
 
 
+def test_why_no_record_can_be_read_is_said(whole: Path) -> None:
+    damaged = whole.with_name("damaged.samples.parquet")
+    content = bytearray(whole.read_bytes())
+    content[4:200] = bytes(196)
+    damaged.write_bytes(content)
+    with (
+        raises_saying(ConfigurationError, damaged.name, "no records can be read", "damaged"),
+        open_recording(damaged, UNITS) as reader,
+    ):
+        list(reader.chunks())
+
+
 def test_a_number_of_rows_that_is_damaged_is_told(whole: Path) -> None:
     """It has no checksum, but the file says it of itself and of its groups."""
     count, content = _as_varint(4 * COUNT), whole.read_bytes()

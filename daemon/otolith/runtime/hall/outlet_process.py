@@ -83,7 +83,7 @@ class OutletProcess:
 
     def poll(self, now: float) -> None:
         """Read answers, kill it if it hangs or is too large, and start it if it does not run."""
-        if not (self._is_needed or self.child.alive) or now - self._looked_at < LOOK_PAUSE:
+        if not (self._serves or self._before or self.child.alive) or now - self._looked_at < LOOK_PAUSE:
             return
         self._looked_at = now
         self._read(now)
@@ -97,12 +97,13 @@ class OutletProcess:
         self.dropped += self._unanswered
         self._unanswered, self._reasons, self._is_ending = 0, {}, False
         self._changes.clear()  # it begins with the machines as they are
-        if self._is_needed and self.child.may_restart(now):
+        if (self._serves or self._before) and self.child.may_restart(now):
             self.child.start(self._first_messages())
 
     @property
-    def _is_needed(self) -> bool:
-        return bool(self._machines or self._unserved or self._before)
+    def _serves(self) -> bool:
+        """Whether a machine has a table."""
+        return bool(self._machines or self._unserved)
 
     def _first_messages(self) -> tuple[tuple[str, MachineOutlets | bool], ...]:
         """Return what a process begins with: it leaves the tables that one before it may not have left."""
@@ -127,8 +128,7 @@ class OutletProcess:
 
     def _end_without_machines(self) -> None:
         """Let it end once no machine has a table."""
-        is_needed = self._machines or self._unserved or self._changes
-        if not (is_needed or self._is_ending) and self.child.offer(None):
+        if not (self._serves or self._changes or self._is_ending) and self.child.offer(None):
             self._is_ending = True
             self.child.reset_backoff()
 
